@@ -34,7 +34,8 @@ from controller.planning.stream_planner import StreamPlanner
 from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, Reaction
 from controller.workspace import PoseGuard
-from hil.loop.driver import Loop, prevent_compilation, stop_quickly
+from hil.loop.driver import FmuRig, Loop, prevent_compilation, stop_quickly
+from hil.loop.own_stages import Stages, ordered, replacements_of
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
 from hil.loop.stage_times import over_budget
 from hil.progress import Say, say_nothing
@@ -78,6 +79,7 @@ def run(
     show: Callable[[RunState], None] = lambda state: None,
     rig: Callable[[Loop], Rig] | None = None,
     say: Say = say_nothing,
+    stages: Stages | None = None,
 ) -> dict[str, Any]:
     """Run the closed loop on the machine's clock, to the end of its motion or until it is asked to stop.
 
@@ -90,6 +92,7 @@ def run(
         show: called ten times a second.
         rig: makes a rig in Python, in the loop's process, instead of the configuration's. Its threads must have ended then.
         say: called with each remark before the loop runs.
+        stages: functions in place of stages of the cycle. They run in the loop's process, within a period.
 
     Returns:
         The summary: `cause` of the stop, `cycles`, missed periods by cause and most in a row, `timing_us` and which of it is
@@ -113,7 +116,7 @@ def run(
     with _asked_to_stop(link), claimed(recording), _reported(state, recorders), contextlib.ExitStack() as at_end:
         at_end.callback(recorders.finish)
         stream, planner = at_end.enter_context(_receiver(config, records, link)) if config.streamed else (None, None)
-        loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream)
+        loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream, stages or Stages())
         theirs.close()
         leftovers: list[Path | None] = []
         at_end.callback(_end, loop, link, leftovers)
@@ -260,6 +263,7 @@ def _prepare_and_follow(
     make_rig: Callable[[Loop], Rig] | None,
     records: Record,
     stream: Record | None,
+    stages: Stages,
 ) -> None:
     with prepared_loop(config, records) as loop, contextlib.ExitStack() as rigs:
         pipe.send(None if loop.plant is None else loop.plant.folder)
@@ -273,6 +277,7 @@ def _prepare_and_follow(
                 "version": version("gough"),
                 "run": run_id,
                 "remarks": list(loop.remarks),
+                "stages": stages.names,
             },
             "parameters": loop.parameters,
             "reference": loop.segments,
@@ -281,7 +286,10 @@ def _prepare_and_follow(
             # Their file may change later.
             header["config"]["frame_definitions"] = loop.frames.frames.text()
         rig = make_rig(loop) if make_rig is not None else rig_of(config)
-        compiled = rig is None or isinstance(rig, UdpRig)
+        if rig is None and stages.names:
+            rig = FmuRig(loop)
+        compiled = (rig is None or isinstance(rig, UdpRig)) and not stages.names
+        replacements = ordered(replacements_of(stages, loop.cycle, loop.parameters, loop.state))
         if isinstance(rig, UdpRig):
             loop.udp = rig.link
         loop.load(python=not compiled)
@@ -300,7 +308,7 @@ def _prepare_and_follow(
             pipe.send((header, refused))
             pipe.recv()
             before = usage()
-            cause = loop.follow(loop.end, None if compiled else rig)
+            cause = loop.follow(loop.end, None if compiled else rig, replacements)
             used = usage().since(before)
         figures = {
             "cause": ": ".join(filter(None, [loop.reason(), loop.failure or getattr(rig, "failure", "")])),

@@ -97,8 +97,8 @@ class PreparedLoop(Loop):
 
 
 @contextmanager
-def prepared_loop(config: SimulationConfig, records: Record | None = None) -> Iterator[PreparedLoop]:
-    """Check everything, load the plant, plan the motion, and load the machine code.
+def prepared_loop(config: SimulationConfig, records: Record | None = None, in_python: bool = False) -> Iterator[PreparedLoop]:
+    """Check everything, load the plant, plan the motion, and load the machine code, or that of a loop that runs `in_python`.
 
     The loop records into `records`, a ring buffer; by default there is room for every cycle.
 
@@ -190,7 +190,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             frames=frames,
         )
         close_loops(loop.loops, position)
-        loop.load(python=config.fusion == "filterpy")
+        loop.load(in_python)
         yield loop
 
 
