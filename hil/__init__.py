@@ -43,8 +43,9 @@ if TYPE_CHECKING:
     from hil.loop.own_stages import Cycle, Stages
     from hil.realtime.scheduling import RealTimeSettings
     from hil.recording.replay import replay
-    from hil.reports.run import write_report
+    from hil.reports.run import figures, write_report
     from hil.runs.config import SimulationConfig
+    from hil.runs.dataset import dataset, frame
     from hil.runs.executive import RunStoppedError, run
     from hil.runs.run_state import RunState
     from hil.runs.simulation import Simulation, SimulationResult, SimulationStoppedError, open_simulation, simulate
@@ -63,9 +64,9 @@ __all__ = [
     "Cycle", "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "OptimisationResult",
     "PlanarMechanism", "RealTimeSettings", "RunState", "RunStoppedError", "Sampling", "Setting", "Simulation",
     "SimulationConfig", "SimulationResult", "SimulationStoppedError", "Snapshot", "Stages", "Study", "SweepResult",
-    "UserFunction", "Wiring", "calibrate_recordings", "calibrate_rig", "load_mechanism", "open_engine", "open_simulation",
-    "optimise", "read_design", "read_snapshot", "read_study", "replay", "run", "run_study", "simulate", "write_report",
-    "write_snapshot",
+    "UserFunction", "Wiring", "calibrate_recordings", "calibrate_rig", "dataset", "figures", "frame", "load_mechanism",
+    "open_engine", "open_simulation", "optimise", "read_design", "read_snapshot", "read_study", "replay", "run", "run_study",
+    "simulate", "write_report", "write_snapshot",
 ]  # fmt: skip
 
 _HOMES = {
@@ -76,8 +77,9 @@ _HOMES = {
     "hil.loop.own_stages": ("Cycle", "Stages"),
     "hil.realtime.scheduling": ("RealTimeSettings",),
     "hil.recording.replay": ("replay",),
-    "hil.reports.run": ("write_report",),
+    "hil.reports.run": ("figures", "write_report"),
     "hil.runs.config": ("SimulationConfig",),
+    "hil.runs.dataset": ("dataset", "frame"),
     "hil.runs.executive": ("RunStoppedError", "run"),
     "hil.runs.run_state": ("RunState",),
     "hil.runs.simulation": ("Simulation", "SimulationResult", "SimulationStoppedError", "open_simulation", "simulate"),

@@ -54,6 +54,13 @@ def write_report(result: SimulationResult, path: Path) -> None:
     write_page(path, title, _configuration(result, summary), body, _SHARED_TIME)
 
 
+def figures(result: SimulationResult) -> dict[str, go.Figure]:
+    """The report's figures, for a notebook: `mechanism`, which moves, `pose`, `errors`, `lengths`, `motion`, `drives`, and
+    `protection` where there is a protection level.
+    """
+    return {"mechanism": _mechanism_view(result)[1]} | {name: figure for name, _, _, figure in _time_figures(result)}
+
+
 def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
     config = result.config
     ran = result.times[-1] + 1.0 / config.rate
