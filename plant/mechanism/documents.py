@@ -1,5 +1,6 @@
 """Mechanisms as TOML documents: presets and files, what they are based on, and their tables."""
 
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -29,20 +30,27 @@ _SAME_FRAMES = 1e-9
 """Largest difference in an entry of rotations that are the same."""
 
 
-def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
+def load_mechanism(name_or_path: str | Path, changes: Mapping[str, Any] | None = None) -> Mechanism | PlanarMechanism:
     """Load a preset by its name, or a mechanism from a TOML file; joints of two numbers make it a planar one.
 
+    Args:
+        name_or_path: of the preset or the file.
+        changes: entries that replace those of the file, by name with dots, such as {"control.proportional": 30.0}.
+
     Raises:
-        UnknownNameError: no such preset, and no such file.
+        UnknownNameError: no such preset, and no such file; or a change leads into something that is no table.
         InputError: the content is not a mechanism.
     """
-    return mechanism_from_text(mechanism_text(name_or_path), str(name_or_path))
+    return mechanism_from_text(mechanism_text(name_or_path), str(name_or_path), changes)
 
 
-def mechanism_from_text(text: str, source: str) -> Mechanism | PlanarMechanism:
-    """The mechanism of a TOML text, which messages call `source`; errors as for `load_mechanism`."""
+def mechanism_from_text(text: str, source: str, changes: Mapping[str, Any] | None = None) -> Mechanism | PlanarMechanism:
+    """The mechanism of a TOML text, which messages call `source`; changes and errors as for `load_mechanism`."""
     try:
-        return mechanism_from_document(mechanism_document(text, source))
+        document = mechanism_document(text, source)
+        for entry, value in (changes or {}).items():
+            set_entry(document, entry, value)
+        return mechanism_from_document(document)
     except (InputError, UnknownNameError) as error:
         raise type(error)(f"{source}: {error}") from None
 
