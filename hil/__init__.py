@@ -5,7 +5,8 @@
     result = simulate(SimulationConfig(target="sines", duration=5.0))
     print(result.summary()["estimation"]["position_rms"])
 
-A run on the machine's clock, as `gough run`:
+Targets as functions, stages of your own, loops that you step, and signals for xarray: docs/python.md. A run on the machine's
+clock, as `gough run`:
 
     from pathlib import Path
 
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from hil.runs.config import SimulationConfig
     from hil.runs.dataset import dataset, frame
     from hil.runs.executive import RunStoppedError, run
+    from hil.runs.operator import Operator
     from hil.runs.run_state import RunState
     from hil.runs.simulation import Simulation, SimulationResult, SimulationStoppedError, open_simulation, simulate
     from hil.runs.snapshot import Snapshot, read_snapshot, write_snapshot
@@ -61,7 +63,7 @@ if TYPE_CHECKING:
     from plant.mechanism import Mechanism, PlanarMechanism, load_mechanism
 
 __all__ = [
-    "Cycle", "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "OptimisationResult",
+    "Cycle", "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "Operator", "OptimisationResult",
     "PlanarMechanism", "RealTimeSettings", "RunState", "RunStoppedError", "Sampling", "Setting", "Simulation",
     "SimulationConfig", "SimulationResult", "SimulationStoppedError", "Snapshot", "Stages", "Study", "SweepResult",
     "UserFunction", "Wiring", "calibrate_recordings", "calibrate_rig", "dataset", "figures", "frame", "load_mechanism",
@@ -81,6 +83,7 @@ _HOMES = {
     "hil.runs.config": ("SimulationConfig",),
     "hil.runs.dataset": ("dataset", "frame"),
     "hil.runs.executive": ("RunStoppedError", "run"),
+    "hil.runs.operator": ("Operator",),
     "hil.runs.run_state": ("RunState",),
     "hil.runs.simulation": ("Simulation", "SimulationResult", "SimulationStoppedError", "open_simulation", "simulate"),
     "hil.runs.snapshot": ("Snapshot", "read_snapshot", "write_snapshot"),

@@ -50,7 +50,7 @@ class SimulationStoppedError(GoughError, RuntimeError):
         self.result = result
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SimulationResult:
     """What a simulation found.
 
@@ -86,6 +86,15 @@ class SimulationResult:
     attitudes: Array | None = None
     heaves: Array | None = None
     stages: dict[str, str] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        errors = self.summary()
+        kind = "estimation" if self.truth_known else "estimated_tracking"
+        what = "estimate - truth" if self.truth_known else "estimate - reference"
+        return (
+            f"<{self.mechanism.name} follows {self.target.name}: {len(self.times)} cycles at {self.config.rate:g} Hz, {what} "
+            f"{1e3 * errors[kind]['position_rms']:.3f} mm RMS>"
+        )
 
     @property
     def moved(self) -> bool:

@@ -71,6 +71,11 @@ def test_quaternions_and_lengths_agree(result, signals):
     np.testing.assert_allclose(lengths, moving.reference_length, rtol=0.0, atol=1e-9)
 
 
+def test_a_result_says_in_a_line_what_it_is(result):
+    rms = 1e3 * result.summary()["estimation"]["position_rms"]
+    assert repr(result) == f"<hexapod follows circle: {len(result.times)} cycles at 250 Hz, estimate - truth {rms:.3f} mm RMS>"
+
+
 def test_a_frame_has_a_column_for_each_number(signals, result):
     table = frame(result)
     assert len(table) == len(result.times) and table.index.name == "time"
