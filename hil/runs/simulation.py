@@ -88,13 +88,11 @@ class SimulationResult:
     stages: dict[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        errors = self.summary()
-        kind = "estimation" if self.truth_known else "estimated_tracking"
-        what = "estimate - truth" if self.truth_known else "estimate - reference"
-        return (
-            f"<{self.mechanism.name} follows {self.target.name}: {len(self.times)} cycles at {self.config.rate:g} Hz, {what} "
-            f"{1e3 * errors[kind]['position_rms']:.3f} mm RMS>"
-        )
+        text = f"{self.mechanism.name} follows {self.target.name}: {len(self.times)} cycles at {self.config.rate:g} Hz"
+        if not self.moved:
+            return f"<{text}, before the motion>"
+        kind, what = ("estimation", "truth") if self.truth_known else ("estimated_tracking", "reference")
+        return f"<{text}, estimate - {what} {1e3 * self.summary()[kind]['position_rms']:.3f} mm RMS>"
 
     @property
     def moved(self) -> bool:

@@ -200,6 +200,7 @@ def test_a_stage_that_fails_before_anything_has_moved_leaves_the_brakes_closed()
     with pytest.raises(SimulationStoppedError, match="a stage in Python has failed") as caught:
         simulate(CONFIG, stages=Stages(pose=lambda cycle: 1 / 0))
     assert (caught.value.result.records["request"] == Request.BRAKED).all()
+    assert "before the motion" in repr(caught.value.result)
 
 
 def test_a_pose_that_is_not_found_ends_the_run():
