@@ -207,9 +207,11 @@ def _print_run(summary: dict[str, Any]) -> None:
         f"{used['involuntary_switches']} involuntary switches, {used['resident']} bytes of growth; "
         f"first cycle {summary['start_up_s']:.2f} s after the start"
     )
-    truth = f"estimate - truth {mm(errors['estimation'])} mm RMS" if errors["known"] else "the truth is not known"
+    truth = "the truth is not known"
+    if errors["known"]:
+        truth = f"estimate - truth {mm(errors['estimation'])} mm, {deg(summary['errors_rad']['estimation'])} deg RMS"
     if errors["known"] and (frames := summary.get("frames")):
-        truth += f", of {frames['tool']} {mm(errors['tool'])} mm RMS"
+        truth += f"; of {frames['tool']} {mm(errors['tool'])} mm RMS"
     print(f"{truth}; reference - length {mm(errors['tracking'])} mm RMS")
     if level := summary["protection"]:
         print(f"greatest protection level {mm(level['position'])} mm, {deg(level['rotation'])} deg")

@@ -96,10 +96,10 @@ def run(
 
     Returns:
         The summary: `cause` of the stop, `cycles`, missed periods by cause and most in a row, `timing_us` and which of it is
-        `over_budget`, `target_stretch` (`controller.planning.pace`), `errors_m`, the number of cycles `unseen` by these,
-        `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles lost), `remarks`, `refused`, `events`, `config`,
-        `version`; of a rig on a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a dry run the
-        `obstacle` to arming, "" if there is none.
+        `over_budget`, `target_stretch` (`controller.planning.pace`), `errors_m` and `errors_rad`, the number of cycles `unseen`
+        by these, `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles lost), `remarks`, `refused`, `events`,
+        `config`, `version`; of a rig on a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a dry
+        run the `obstacle` to arming, "" if there is none.
 
     Raises:
         GoughError: something in the configuration or the settings cannot be used; nothing has run.
@@ -334,6 +334,7 @@ def _summary(
         "timing_us": timing,
         "over_budget": over_budget(timing, config.fusion),
         "errors_m": state.errors(),
+        "errors_rad": state.rotation_errors(),
         **({} if state.frames is None else {"frames": state.frames.described()}),
         "protection": state.level(),
         "start_up_s": since_process_start() - (time.monotonic() - first),
