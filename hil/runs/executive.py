@@ -98,8 +98,8 @@ def run(
         The summary: `cause` of the stop, `cycles`, missed periods by cause and most in a row, `timing_us` and which of it is
         `over_budget`, `target_stretch` (`controller.planning.pace`), `errors_m` and `errors_rad`, the number of cycles `unseen`
         by these, `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles lost), `remarks`, `refused`, `events`,
-        `config`, `version`; of a rig on a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a dry
-        run the `obstacle` to arming, "" if there is none.
+        `config`, `version`; of a rig on a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a
+        dry run the `obstacle` to arming, "" if there is none.
 
     Raises:
         GoughError: something in the configuration or the settings cannot be used; nothing has run.
