@@ -47,6 +47,9 @@ _FARTHEST_M, _FARTHEST_RAD = 1.0, np.pi
 _LEAST_JOG = 1e-5
 """A jog that could go no farther is refused [m or rad]."""
 
+_OUT_OF_PLANE = 1e-9
+"""A planar mechanism may be asked to leave its plane by so much, which is rounding [m or rad]."""
+
 _STEP_M, _STEP_RAD = 1e-3, np.radians(0.2)
 """Poses of a way are checked so far apart."""
 
@@ -114,6 +117,7 @@ class OperatedPlatform:
     Attributes:
         pose: of {2}, where the platform rests or its move has begun.
         jogging: whether it moves only as long as its operator says so.
+        paused: whether it rests, or comes to rest, on a way that can be resumed.
     """
 
     def __init__(self, stream: Record, workplace: Workplace, period: float) -> None:
@@ -121,8 +125,9 @@ class OperatedPlatform:
         _load(workplace)
         self._planner = workplace.planner()
         self._offers = PlanOffers(stream, self._planner, period)
-        self.pose, self.jogging = workplace.home, False
+        self.pose, self.jogging, self.paused = workplace.home, False, False
         self._way: StraightWay | None = None
+        self._towards: tuple[ActiveFrames, Pose, ToolLimits | None] | None = None  # frames, end and limits of the last way
         self._began = self._offered = 0.0
         self._beaten = self._stepped = 0.0
         self._deadman = DEADMAN_S
@@ -186,6 +191,7 @@ class OperatedPlatform:
             raise InputError(f"deadman is {deadman:g} s; it must be positive, and {MOST_DEADMAN_S:g} s at most")
         rate = Move(velocity, turn_velocity, axes)
         self._place.frames.rate(self.pose, rate)
+        self._require_plane(self._place.frames, rate)
         speeds = [float(np.linalg.norm(np.asarray(each, float))) for each in (velocity, turn_velocity)]
         if not max(speeds) > 0.0:
             raise InputError("the jog has no speed: give one along or about an axis")
@@ -208,21 +214,38 @@ class OperatedPlatform:
         self._beaten = time.monotonic()
 
     def stop(self) -> None:
-        """Come to rest on the way."""
+        """Come to rest on the way, for good."""
         if self._way is not None:
             self._way.stop(self._ahead() - self._began)
             self._ended_by = ""
-        self.jogging = False
+        self.jogging = self.paused = False
+
+    def pause(self) -> None:
+        """Come to rest on the way, which `resume` takes up again; a jog has no end to go on to, and stops."""
+        paused = self._way is not None and not self.jogging
+        self.stop()
+        self.paused = paused
+
+    def resume(self) -> float:
+        """Go on to where the platform went when it was paused; as `go_to`."""
+        self._require_rest()
+        if not self.paused or self._towards is None:
+            raise RefusedError("no move has been paused: there is nothing to go on with")
+        frames, end, limits = self._towards
+        move = frames.move_between(self.pose, end)
+        self.paused = False
+        return 0.0 if is_nothing(move) else self._begin(frames, move, limits)
 
     def lose_operator(self) -> None:
-        """End the run by a controlled stop if the operator has gone while it jogged."""
+        """End the run by a controlled stop if the operator has gone while it jogged; forget what was paused."""
+        self.paused = False
         if self.jogging:
             fail_stream(self._stream, Cause.OPERATOR_LOST, -1, time.monotonic() - self._beaten, self._deadman)
             self.end(Cause.OPERATOR_LOST.short)
 
     def end(self, reason: str) -> None:
         """Note that the run has stopped, and why: nothing moves any more."""
-        self._over, self._way, self.jogging = reason, None, False
+        self._over, self._way, self.jogging, self.paused = reason, None, False, False
 
     def step(self) -> str:
         """Go on with the move; to be called each few milliseconds. Returns what has ended, in words, or ""."""
@@ -264,7 +287,7 @@ class OperatedPlatform:
         if behind:
             return "the plans did not keep up with the move, which ended early"
         if stopped:
-            return "stopped"
+            return "paused" if self.paused else "stopped"
         return f"stopped at a limit: {self._ended_by}" if self._ended_by else "arrived"
 
     def _require_rest(self) -> None:
@@ -276,7 +299,19 @@ class OperatedPlatform:
             raise RefusedError("the platform is moving: stop it first, or wait until it rests")
         self._ended_by = ""
 
+    def _require_plane(self, frames: ActiveFrames, move: Move) -> None:
+        """Refuse a move out of the plane of a planar mechanism."""
+        if not self._place.mechanism.planar:
+            return
+        axes = frames.axes(self.pose, move.axes)
+        straight, turn = axes @ np.asarray(move.translation, float), axes @ np.asarray(move.rotation_vector, float)
+        if not max(abs(straight[2]), abs(turn[0]), abs(turn[1])) <= _OUT_OF_PLANE:
+            raise RefusedError(
+                f"{self._place.mechanism.name} moves in its plane alone, along x and y and about z: leave z, rx and ry out"
+            )
+
     def _begin(self, frames: ActiveFrames, move: Move, limits: ToolLimits | None) -> float:
+        self._require_plane(frames, move)
         way = StraightWay(
             self._place.mechanism, frames, self.pose, move, limits or ToolLimits(speed=SPEED, turn_speed=TURN_SPEED)
         )
@@ -284,7 +319,7 @@ class OperatedPlatform:
         self._began = self._ahead()
         self._offered = -inf
         self._planner.lead(way)
-        self._way = way
+        self._way, self._towards, self.paused = way, (frames, way.poses(np.array(1.0)), limits), False
         note_sample(self._stream, time.monotonic_ns() + _STALL_NS)
         return way.duration
 
@@ -332,8 +367,8 @@ class OperatedPlatform:
 def _load(workplace: Workplace) -> None:
     """Load the machine code of a move: while one goes on there is not enough time."""
     load_handover()
-    up = Move((0.0, 0.0, 1e-3))
-    way, planner = StraightWay(workplace.mechanism, workplace.frames, workplace.home, up), workplace.planner()
+    aside = Move((1e-3, 0.0, 0.0))
+    way, planner = StraightWay(workplace.mechanism, workplace.frames, workplace.home, aside), workplace.planner()
     poses = way.poses(np.array([0.0]))
     first_excess(workplace.mechanism, np.zeros(1), poses.position, poses.rotation, workplace.demands)
     planner.lead(way)
