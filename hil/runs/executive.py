@@ -108,7 +108,8 @@ def run(
     with _asked_to_stop(link), claimed(recording), contextlib.ExitStack() as at_end:
         stream: Record | None = shared_array(1, STREAM).reshape(()) if config.streamed else None
         # Forked before there is a pipe, which they would keep open.
-        planner = channel = at_end.enter_context(channel_process(config, records, link, stream, say))
+        remarks: list[str] = []
+        planner = channel = at_end.enter_context(channel_process(config, records, link, stream, remarks.append))
         if stream is not None and not config.operated:
             planner = at_end.enter_context(_receiver(config, stream))
         ours, theirs = FORK.Pipe()
@@ -121,7 +122,7 @@ def run(
         at_end.callback(_end, loop, link, leftovers)
         leftovers.append(_prepared(ours, loop, link, show, state))
         header, state.refused = _prepared(ours, loop, link, show, state)
-        for remark in header["config"]["remarks"]:
+        for remark in (*remarks, *header["config"]["remarks"]):
             say(remark)
         recorders.start(header)
         with contextlib.suppress(BrokenPipeError):

@@ -131,6 +131,12 @@ class Operator:
         answer = self.ask("move", to=to, frame=frame, tool=tool, speed=speed, turn_speed=turn_speed)
         return self.wait(answer["duration"]) if wait else answer
 
+    def follow(self, to: str | Mapping[str, Any], frame: str | None = None, tool: str | None = None) -> dict[str, Any]:
+        """Go to a point or a place as `move` has it, and to the next one at once when it is asked for, without a rest; returns
+        the answer.
+        """
+        return self.ask("follow", to=to, frame=frame, tool=tool)
+
     def step(
         self, translation: Sequence[float] = (0.0, 0.0, 0.0), rotation: Sequence[float] = (0.0, 0.0, 0.0),
         axes: str | None = None, speed: float | None = None, turn_speed: float | None = None, wait: bool = True,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from controller.frames import Move
 from controller.planning.motions.document import place_of
-from controller.planning.motions.elements import ToolLimits
+from controller.planning.motions.elements import Place, ToolLimits
 from controller.planning.points import HOME
 from controller.safety.causes import Cause
 from hil.loop.records import Link, StopRequest
@@ -31,7 +31,7 @@ from hil.realtime.scheduling import come_before_others
 from hil.recording.mcap import events_of, take
 from hil.runs.channel_process import MOST_CLIENTS
 from hil.runs.operated_platform import DEADMAN_S, SPEED, TURN_SPEED, OperatedPlatform, RefusedError, Workplace
-from hil.runs.operator_messages import MOST_LINE, VERSION, decode, encode, pose_message
+from hil.runs.operator_messages import MOST_LINE, RUN_ENDED, VERSION, decode, encode, pose_message
 from hil.runs.telemetry import (
     estimated_pose,
     frames_message,
@@ -127,14 +127,15 @@ class _Channel:
         self._waiting = 0
         self._measured, self._told_margins = -np.inf, list[dict[str, Any]]()
         self._doing: dict[str, Callable[[_Client, dict[str, Any]], dict[str, Any]]] = {
-            "move": self._move, "step": self._step_by, "jog": self._jog, "beat": self._beat, "stop": self._stop,
-            "pause": self._pause, "resume": self._resume, "end": self._end, "emergency": self._emergency,
-            "state": self._state, "margins": self._margins, "watch": self._watch,
+            "move": self._move, "follow": self._follow, "step": self._step_by, "jog": self._jog, "beat": self._beat,
+            "stop": self._stop, "pause": self._pause, "resume": self._resume, "end": self._end,
+            "emergency": self._emergency, "state": self._state, "margins": self._margins, "watch": self._watch,
         }  # fmt: skip
 
     async def run(self, listener: socket.socket) -> None:
         """Serve until the run ends."""
-        parent = os.getppid()
+        # The parent may have died already.
+        parent = int(self._link[Link.SUPERVISOR]) or os.getppid()
         server = await asyncio.start_server(self._serve, sock=listener, limit=MOST_LINE)
         clock = asyncio.get_running_loop()
         while not (self._link[Link.DONE] or os.getppid() != parent):
@@ -143,7 +144,7 @@ class _Channel:
             self._look(clock.time())
             await asyncio.sleep(_STEP_S if self._platform is not None else _LOOK_S if self._clients else _IDLE_S)
         self._look(np.inf)
-        self._tell({"event": "the run has ended"})
+        self._tell({"event": RUN_ENDED})
         server.close()
         for client in self._clients:
             client.writer.close()
@@ -267,10 +268,11 @@ class _Channel:
 
     def _move(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client
-        to = request.get("to")
-        where = to if isinstance(to, str) else place_of(to, "to")
-        frame, tool = _name_in(request, "frame"), _name_in(request, "tool")
-        return {"duration": self._moved.go_to(where, frame, tool, _limits_in(request))}
+        return {"duration": self._moved.go_to(*_goal_in(request), _limits_in(request))}
+
+    def _follow(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client
+        return {"duration": self._moved.follow(*_goal_in(request))}
 
     def _step_by(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client
@@ -395,6 +397,12 @@ def _name_in(request: dict[str, Any], name: str) -> str | None:
     if not (given is None or isinstance(given, str)):
         raise InputError(f"{name} must be a text")
     return given
+
+
+def _goal_in(request: dict[str, Any]) -> tuple[Place | str, str | None, str | None]:
+    """A place or a point's name, and the frame and the tool."""
+    to = request.get("to")
+    return to if isinstance(to, str) else place_of(to, "to"), _name_in(request, "frame"), _name_in(request, "tool")
 
 
 def _limits_in(request: dict[str, Any]) -> ToolLimits:

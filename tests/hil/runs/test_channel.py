@@ -47,7 +47,7 @@ def test_an_observer_watches_and_an_operator_may_end_the_run_but_not_move_it():
             with pytest.raises(RequestRefusedError, match="an observer gives no orders"):
                 observer.ask(order)
         with Operator(run.config.channel) as operator:
-            for order in ("move", "step", "jog", "beat", "stop", "pause", "resume"):
+            for order in ("move", "follow", "step", "jog", "beat", "stop", "pause", "resume"):
                 with pytest.raises(RequestRefusedError, match="follows sines: only one with --target operator") as refused:
                     operator.ask(order, to="home")
                 assert refused.value.kind == "refused"

@@ -297,6 +297,7 @@ def test_a_planar_mechanism_moves_in_its_plane_alone():
             lambda: operator.step((0.0, 0.0, 0.005)),
             lambda: operator.step(rotation=(0.1, 0.0, 0.0)),
             lambda: operator.move({"position": [0.0, 0.0, 0.01]}),
+            lambda: operator.follow({"position": [0.0, 0.0, 0.01]}),
             lambda: next(operator.jog(turn_velocity=(0.0, 0.1, 0.0))),
         ):
             with pytest.raises(RequestRefusedError, match=in_plane):
@@ -308,6 +309,43 @@ def test_a_planar_mechanism_moves_in_its_plane_alone():
         positions, _ = run.check()
         np.testing.assert_allclose(positions[-1], home, atol=1e-7)
         assert not run.references()[:, 3:].any() and run.cause[0] == Cause.NONE
+
+
+def test_a_goal_that_changes_is_followed_without_a_rest_and_within_all_limits(hexapod):
+    home = hexapod.home.position
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        begin = int(run.shared["cycle"][0])
+        for number in range(1, 21):
+            operator.follow({"position": [0.001 * number, -0.0005 * number, 0.0], "rotation": [0.0, 0.0, 0.004 * number]})
+            time.sleep(0.05)
+        under_way = int(run.shared["cycle"][0])
+        with pytest.raises(RequestRefusedError, match="the platform is moving: stop it first"):
+            operator.move("home")
+        with pytest.raises(RequestRefusedError, match=r"stroke of leg \d would be .* mm, with a limit of"):
+            operator.follow({"position": [0.0, 0.0, 0.3]})
+        there = operator.wait(1.0)["commanded"]
+        np.testing.assert_allclose(there["position"], home + [0.02, -0.01, 0.0], atol=1e-9)
+        np.testing.assert_allclose(there["rotation"], [0.0, 0.0, 0.08], atol=1e-9)
+        # It never rests between goals.
+        speeds = np.abs(run.kept[begin + 300 : under_way, :, 1]).max(axis=1)
+        assert speeds.min() > 1e-3
+        # Back and forth, with a stop on the way.
+        operator.follow("home")
+        time.sleep(0.1)
+        operator.follow({"position": [0.02, 0.0, 0.0], "rotation": [0.1, 0.0, 0.0]})
+        time.sleep(0.2)
+        operator.stop()
+        operator.wait(0.0)
+        operator.follow({"position": [0.0, 0.01, 0.0], "rotation": [0.0, 0.0, 0.0]})
+        time.sleep(0.1)
+        operator.pause()
+        assert operator.wait(0.0)["paused"]
+        there = operator.resume()["commanded"]
+        np.testing.assert_allclose(there["position"], home + [0.0, 0.01, 0.0], atol=1e-9)
+        positions, _ = run.check()
+        np.testing.assert_allclose(positions[-1], there["position"], atol=1e-7)
+        assert run.cause[0] == Cause.NONE
 
 
 def test_a_move_that_is_paused_goes_on_to_its_end_and_a_jog_stops(hexapod):
