@@ -91,8 +91,9 @@ class FollowedGoal:
         """Lengths [m] and rates [m/s] (n,) of the legs at a time after the begin [s]; at rest the rates are exactly 0."""
         if ahead >= self.duration:
             return self.lengths, np.zeros(self._mechanism.legs)
-        before, here, after = (self._lengths(ahead + step) for step in (-_DIFFERENCE_S, 0.0, _DIFFERENCE_S))
-        return here, (after - before) / (2.0 * _DIFFERENCE_S)
+        ahead = max(ahead, self._began)
+        before, after = max(ahead - _DIFFERENCE_S, self._began), min(ahead + _DIFFERENCE_S, self.duration)
+        return self._lengths(ahead), (self._lengths(after) - self._lengths(before)) / (after - before)
 
     def _state(self, time: float) -> tuple[list[float], list[float], list[float]]:
         within = min(max(time - self._began, 0.0), self._trajectory.duration)

@@ -317,15 +317,15 @@ def test_a_goal_that_changes_is_followed_without_a_rest_and_within_all_limits(he
         begun(operator)
         begin = int(run.shared["cycle"][0])
         for number in range(1, 21):
-            operator.follow({"position": [0.001 * number, -0.0005 * number, 0.0], "rotation": [0.0, 0.0, 0.004 * number]})
+            operator.follow({"position": [0.003 * number, -0.0015 * number, 0.0], "rotation": [0.0, 0.0, 0.004 * number]})
             time.sleep(0.05)
         under_way = int(run.shared["cycle"][0])
         with pytest.raises(RequestRefusedError, match="the platform is moving: stop it first"):
             operator.move("home")
         with pytest.raises(RequestRefusedError, match=r"stroke of leg \d would be .* mm, with a limit of"):
             operator.follow({"position": [0.0, 0.0, 0.3]})
-        there = operator.wait(1.0)["commanded"]
-        np.testing.assert_allclose(there["position"], home + [0.02, -0.01, 0.0], atol=1e-9)
+        there = operator.wait(3.0)["commanded"]
+        np.testing.assert_allclose(there["position"], home + [0.06, -0.03, 0.0], atol=1e-9)
         np.testing.assert_allclose(there["rotation"], [0.0, 0.0, 0.08], atol=1e-9)
         # It never rests between goals.
         speeds = np.abs(run.kept[begin + 300 : under_way, :, 1]).max(axis=1)
@@ -345,6 +345,24 @@ def test_a_goal_that_changes_is_followed_without_a_rest_and_within_all_limits(he
         np.testing.assert_allclose(there["position"], home + [0.0, 0.01, 0.0], atol=1e-9)
         positions, _ = run.check()
         np.testing.assert_allclose(positions[-1], there["position"], atol=1e-7)
+        assert run.cause[0] == Cause.NONE
+
+
+@pytest.mark.slow
+def test_a_way_that_is_followed_keeps_to_the_limits_between_two_poses_that_can_be_reached(hexapod):
+    first, last = (0.109, -0.028, -0.01, 0.027, 0.122, 0.036), (-0.01, 0.118, -0.018, 0.283, 0.015, -0.01)
+    middle = 0.5 * np.add(first, last)
+    position, rotation = hexapod.home.position + middle[:3], rotation_from_vector(middle[3:])
+    assert margins(hexapod, position[None], rotation[None]).of("stroke").min() < -5e-3
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        operator.move({"position": first[:3], "rotation": first[3:]}, speed=0.3, turn_speed=2.0)
+        with pytest.raises(RequestRefusedError, match="on the straight way there, stroke of leg"):
+            operator.move({"position": last[:3], "rotation": last[3:]})
+        operator.follow({"position": last[:3], "rotation": last[3:]})
+        there = operator.wait(10.0)["commanded"]
+        positions, _ = run.check()
+        np.testing.assert_allclose(positions[-1], there["position"], atol=1e-6)
         assert run.cause[0] == Cause.NONE
 
 
