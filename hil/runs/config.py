@@ -50,11 +50,13 @@ RIGS = ("fmu", "udp", "canopen", "replay")
 DRIVES = VELOCITY_DRIVES, POSITION_DRIVES = "velocity", "position"
 """What the drives close a loop of: nothing, as they turn a velocity into a voltage, or their position."""
 
-OF_RUNS = ("rig", "rig_at", "arm", "points", "token_file")
+OF_RUNS = ("rig", "rig_at", "arm", "channel", "points", "token_file")
 """Fields that say something to a run on the clock alone, and nothing to a simulation."""
 
 OPERATOR_CHANNEL = "127.0.0.1:47300"
-"""Where a run listens for its operator, if its target names no address."""
+"""Where a run listens for operators and observers, if nothing names another address."""
+
+NO_CHANNEL = "none"
 
 PYTHON_RIG = "python:"
 """The prefix of a rig in the user's own Python class, such as python:my_rig:MyRig (module and class)."""
@@ -181,13 +183,19 @@ class SimulationConfig:
     time_scale: float = option(
         1.0, "factor on the times of the target: 2 is half as fast, as what is too fast is told to take; 0.01 to 1000"
     )
+    channel: str | None = option(
+        None,
+        "where the run listens for 'gough panel' and other clients, which may watch it and end it, or none (docs/operating.md)",
+        metavar="HOST:PORT",
+        shown=f"{OPERATOR_CHANNEL} if it is free",
+    )
     points: NamedOrNone["Never"] = named(
         None, "with --target operator: named points to go to (docs/operating.md)", metavar="FILE.toml"
     )
     token_file: NamedOrNone["Never"] = named(
         None,
-        "with --target operator: the token that clients must give, which an address beyond this machine needs; also the "
-        "variable GOUGH_TOKEN",
+        "the token that clients of the channel must give, which an address beyond this machine needs; also the variable "
+        "GOUGH_TOKEN",
         metavar="FILE",
     )
     magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
@@ -233,9 +241,15 @@ class SimulationConfig:
             raise InputError(
                 f"--fault is for a simulated plant, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
             )
-        if not self.operated and (self.points is not None or self.token_file is not None):
-            name = "--points" if self.points is not None else "--token-file"
-            raise InputError(f"{name} is for a run that an operator moves: add --target operator, or leave it out")
+        if not self.operated and self.points is not None:
+            raise InputError("--points is for a run that an operator moves: add --target operator, or leave it out")
+        if self.channel == NO_CHANNEL and (self.operated or self.token_file is not None):
+            what = "an operator moves the platform" if self.operated else "--token-file gives its token"
+            raise InputError(f"--channel is {NO_CHANNEL}, but {what} over the channel: leave one of them out")
+        if self.operated and ":" in self.target and self.channel is not None:
+            raise InputError(
+                f"--target {self.target} and --channel {self.channel} both say where the channel is: leave one out"
+            )
         # Refuses words that none understands.
         self.base_motions  # noqa: B018
         for each in self.disturbances:
@@ -331,6 +345,14 @@ class SimulationConfig:
     def operated(self) -> bool:
         """Whether an operator moves the platform while the loop runs."""
         return self.target == OPERATOR_TARGET or self.target.startswith(f"{OPERATOR_TARGET}:")
+
+    @property
+    def channel_address(self) -> str | None:
+        """Where the run listens for clients; None for no channel."""
+        if self.channel == NO_CHANNEL:
+            return None
+        named = self.target.partition(":")[2] if self.operated else ""
+        return named or self.channel or OPERATOR_CHANNEL
 
     @property
     def streamed(self) -> bool:

@@ -25,11 +25,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.frames import ActiveFrames, Frames
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.pace import least_time_scale
 from controller.planning.plan_handover import END_PLANNER, STREAM, fail_stream
-from controller.planning.points import load_points
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, Reaction
@@ -45,9 +43,8 @@ from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_s
 from hil.rigs import Rig
 from hil.rigs.udp.link import parse_address
 from hil.rigs.udp.rig import UdpRig
-from hil.runs.config import OPERATOR_CHANNEL, SimulationConfig
-from hil.runs.operated_platform import Workplace
-from hil.runs.operator_messages import channel_address, load_token
+from hil.runs.channel_process import channel_process
+from hil.runs.config import SimulationConfig
 from hil.runs.prepare import demands_of, prepared_loop, rig_of
 from hil.runs.recorders import Recorders, claimed
 from hil.runs.run_state import RunState
@@ -111,18 +108,24 @@ def run(
     link: NDArray[np.int64] = shared_array(LINK_SIZE, np.dtype(np.int64))
     link[Link.SUPERVISOR] = os.getpid()
     state = RunState(frames=config.active_frames)
-    ours, theirs = FORK.Pipe()
-    recorders = Recorders(recording, records, link, ours, state.events)
-    with _asked_to_stop(link), claimed(recording), _reported(state, recorders), contextlib.ExitStack() as at_end:
+    with _asked_to_stop(link), claimed(recording), contextlib.ExitStack() as at_end:
+        stream: Record | None = shared_array(1, STREAM).reshape(()) if config.streamed else None
+        # Forked before there is a pipe, which they would keep open.
+        remarks: list[str] = []
+        planner = channel = at_end.enter_context(channel_process(config, records, link, stream, remarks.append))
+        if stream is not None and not config.operated:
+            planner = at_end.enter_context(_receiver(config, stream))
+        ours, theirs = FORK.Pipe()
+        recorders = Recorders(recording, records, link, ours, state.events)
+        at_end.enter_context(_reported(state, recorders))
         at_end.callback(recorders.finish)
-        stream, planner = at_end.enter_context(_receiver(config, records, link)) if config.streamed else (None, None)
         loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream, stages or Stages())
         theirs.close()
         leftovers: list[Path | None] = []
         at_end.callback(_end, loop, link, leftovers)
         leftovers.append(_prepared(ours, loop, link, show, state))
         header, state.refused = _prepared(ours, loop, link, show, state)
-        for remark in header["config"]["remarks"]:
+        for remark in (*remarks, *header["config"]["remarks"]):
             say(remark)
         recorders.start(header)
         with contextlib.suppress(BrokenPipeError):
@@ -135,6 +138,9 @@ def run(
                 state.events.append(f"the loop has not answered for {PATIENCE_S:g} s and was killed: the rig brakes by itself")
                 loop.kill()
             recorders.watch()
+            if channel is not None and not config.operated and not channel.is_alive():
+                state.events.append(f"the channel has died (exit code {channel.exitcode}): nobody can watch this run any more")
+                channel = None
             if stream is not None and planner is not None and not planner.is_alive():
                 # At rest nothing else would tell that nobody can move the platform any more.
                 fail_stream(stream, Cause.TARGET_LOST, -1, np.nan, np.nan)
@@ -179,31 +185,18 @@ def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
 
 
 @contextmanager
-def _receiver(config: SimulationConfig, records: Record, link: NDArray[np.int64]) -> Iterator[tuple[Record, BaseProcess]]:
-    """The memory that the process of a target which comes while the loop runs shares with the loop, and that process."""
-    stream: Record = shared_array(1, STREAM).reshape(())
-    mechanism, period = load_spatial(config.mechanism), 1.0 / config.rate
-    demands = demands_of(config, mechanism)
-    with contextlib.ExitStack() as opened:
-        if config.operated:
-            # Only a run with an operator loads it.
-            from hil.runs.operator_channel import open_channel, serve_operator
-
-            token = load_token(config.token_file)
-            host, port = channel_address(config.target.partition(":")[2] or OPERATOR_CHANNEL, token)
-            points = {} if config.points is None else load_points(config.points)
-            workplace = Workplace(mechanism, config.active_frames or ActiveFrames(Frames()), demands, points)
-            listener = opened.enter_context(open_channel(host, port))
-            process = started(serve_operator, stream, listener, token, workplace, period, records, link)
-        else:
-            host, port = parse_address(config.target.partition(":")[2] or f"{HOST}:{PORT}")
-            start = mechanism.require_home()
-            lengths = leg_lengths(mechanism, start.position, start.rotation)
-            planner = StreamPlanner(mechanism, lengths, config.active_frames, PoseGuard(mechanism, demands))
-            listener = opened.enter_context(open_socket(host, port))
-            process = started(receive, stream, planner, listener, period)
+def _receiver(config: SimulationConfig, stream: Record) -> Iterator[BaseProcess]:
+    """The process that receives a streamed target while the context lasts, and plans in the memory that the loop shares."""
+    mechanism = load_spatial(config.mechanism)
+    host, port = parse_address(config.target.partition(":")[2] or f"{HOST}:{PORT}")
+    start = mechanism.require_home()
+    lengths = leg_lengths(mechanism, start.position, start.rotation)
+    guard = PoseGuard(mechanism, demands_of(config, mechanism))
+    planner = StreamPlanner(mechanism, lengths, config.active_frames, guard)
+    with open_socket(host, port) as listener:
+        process = started(receive, stream, planner, listener, 1.0 / config.rate)
         try:
-            yield stream, process
+            yield process
         finally:
             stream["shared"][END_PLANNER] = 1
             join_or_kill(process)

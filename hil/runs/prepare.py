@@ -213,8 +213,11 @@ def _check_memory(config: SimulationConfig, count: int) -> None:
 def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
     if config.fusion != "compiled":
         raise InputError(f"fusion {config.fusion!r} is for six legs; for {config.mechanism}, which is planar, take 'compiled'")
-    if config.streamed:
-        raise InputError(f"a target can be streamed to six legs alone; {config.mechanism} is planar: give a motion or a file")
+    if config.streamed and not config.operated:
+        raise InputError(
+            f"a target can be streamed to six legs alone; {config.mechanism} is planar: give a motion or a file, or move it "
+            "with --target operator"
+        )
     if config.frames is not None:
         raise InputError(f"frames are for six legs; {config.mechanism} is planar: leave --frames out")
     if calibration.joints.any():

@@ -81,11 +81,11 @@ def load_in_space(name_or_path: str | Path) -> Mechanism:
 
 def mechanism_text(name_or_path: str | Path) -> str:
     """The TOML text of a preset, or of a file; errors as for `load_mechanism`."""
-    if str(name_or_path) in _preset_names():
+    if str(name_or_path) in preset_names():
         return (_PRESETS / f"{name_or_path}.toml").read_text()
     path = Path(name_or_path)
     if not path.is_file():
-        names = _preset_names()
+        names = preset_names()
         raise UnknownNameError(
             f"no mechanism {str(path)!r}: neither a preset ({', '.join(names)}) nor a file{nearest(str(path), names)}"
         )
@@ -227,7 +227,8 @@ def _check_table(inner: Any, entry: str) -> None:
         raise UnknownNameError(f"the mechanism has no entry {entry}: {'.'.join(entry.split('.')[:-1])} is no table")
 
 
-def _preset_names() -> list[str]:
+def preset_names() -> list[str]:
+    """The names of all presets."""
     return sorted(entry.name.removesuffix(".toml") for entry in _PRESETS.iterdir() if entry.name.endswith(".toml"))
 
 
@@ -236,8 +237,8 @@ def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
     names = [source]
     while "based_on" in document:
         names.append(document.pop("based_on"))
-        if names[-1] not in _preset_names():
-            presets = _preset_names()
+        if names[-1] not in preset_names():
+            presets = preset_names()
             question = nearest(str(names[-1]), presets)
             raise UnknownNameError(f"based_on names no preset: {names[-1]!r}; there are {', '.join(presets)}{question}")
         if names[-1] in names[:-1]:

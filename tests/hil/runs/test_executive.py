@@ -29,6 +29,7 @@ from hil.runs.executive import RunStoppedError, run
 from hil.runs.prepare import prepared_loop
 from plant.errors import GoughError, InputError
 from plant.mechanism import load_mechanism
+from tests.hil.runs.test_hardware_in_the_loop import free_port
 
 ROOT = os.geteuid() == 0
 CONFIG = SimulationConfig(target="sines", duration=1.0, rate=500.0)
@@ -87,7 +88,8 @@ def started(path, *options, **environment):
     process = gough("run", "--duration", 60, "--rate", 500, "--most-missed", 2000, "--record", path, *options, **environment)
     wait_for(lambda: recorded_cycles(path) > 300 or process.poll() is not None)
     assert process.poll() is None, process.communicate()
-    loop, recorder = children(process.pid)
+    # The channel comes before them, if its address is free.
+    loop, recorder = children(process.pid)[-2:]
     return process, loop, recorder
 
 
@@ -576,8 +578,9 @@ def gone(*pids):
 
 @pytest.mark.slow
 def test_when_the_supervisor_is_killed_before_the_start_nothing_stays(tmp_path):
-    process = gough("run", "--duration", 60, "--rate", 500, "--record", tmp_path / "run.mcap")
-    wait_for(lambda: children(process.pid) or process.poll() is not None)
+    channel = f"127.0.0.1:{free_port()}"
+    process = gough("run", "--duration", 60, "--rate", 500, "--record", tmp_path / "run.mcap", "--channel", channel)
+    wait_for(lambda: len(children(process.pid)) > 1 or process.poll() is not None)
     others = children(process.pid)
     process.kill()
     process.communicate()
@@ -597,7 +600,7 @@ def test_a_recorder_killed_at_once_costs_nothing(tmp_path):
     path, figures = tmp_path / "run.mcap", tmp_path / "run.json"
     process = gough("run", "--duration", 1.5, "--rate", 500, "--most-missed", 2000, "--record", path, "--json", figures)
     wait_for(lambda: path.exists() and path.stat().st_size)
-    os.kill(children(process.pid)[1], signal.SIGKILL)
+    os.kill(children(process.pid)[-1], signal.SIGKILL)
     _, errors = process.communicate(timeout=60.0)
     assert process.returncode == 0, errors
     summary = json.loads(figures.read_text())
