@@ -76,17 +76,17 @@ def is_ours(pid):
     return False
 
 
-def wait_for(condition, seconds=60.0):
+def wait_for(condition, seconds=60.0, pause=0.02):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "it takes too long"
-        time.sleep(0.02)
+        time.sleep(pause)
 
 
 def started(path, *options, **environment):
     """A run in a process of its own that is well under way: that, and the loop's and the recorder's process."""
     process = gough("run", "--duration", 60, "--rate", 500, "--most-missed", 2000, "--record", path, *options, **environment)
-    wait_for(lambda: recorded_cycles(path) > 300 or process.poll() is not None)
+    wait_for(lambda: recorded_cycles(path) > 300 or process.poll() is not None, pause=0.1)
     assert process.poll() is None, process.communicate()
     # The channel comes before them, if its address is free.
     loop, recorder = children(process.pid)[-2:]
@@ -158,7 +158,7 @@ def test_a_replay_is_the_run_bit_for_bit(recorded):
     assert process.returncode == 0
 
 
-@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+@pytest.mark.parametrize("fusion", [pytest.param("compiled", marks=pytest.mark.slow), "whole"])
 def test_a_replay_has_the_added_sensors(fusion, tmp_path):
     """Lengths and the base's IMU are as much part of a recording as the other IMUs."""
     added = ["--lengths", "incremental", "--base-imu", "--fault", "base-tilt,axis=x,size_deg=3,sine_hz=0.2,at=0.1"]
@@ -315,7 +315,7 @@ def test_an_emergency_stop_is_heard_by_a_run_that_was_told_to_ignore_it(tmp_path
     for pid in (process.pid, *others):
         os.kill(pid, signal.SIGINT)
     cycles = recorded_cycles(path)
-    wait_for(lambda: recorded_cycles(path) > cycles + 300 or process.poll() is not None)
+    wait_for(lambda: recorded_cycles(path) > cycles + 300 or process.poll() is not None, pause=0.1)
     process.send_signal(signal.SIGQUIT)
     _, errors = process.communicate(timeout=30.0)
     said = errors.splitlines()[0]
@@ -361,7 +361,7 @@ def test_when_the_recorder_is_killed_another_goes_on_and_no_cycle_is_lost_or_dou
     process, loop, recorder = started(path)
     os.kill(recorder, signal.SIGKILL)
     second = tmp_path / "run-2.mcap"
-    wait_for(lambda: recorded_cycles(second) > 300)
+    wait_for(lambda: recorded_cycles(second) > 300, pause=0.1)
     assert Path(f"/proc/{loop}").exists()
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=30.0)
@@ -394,7 +394,7 @@ def test_a_recording_that_is_spoiled_while_it_goes_on_is_noticed_and_the_rest_is
     process, *_ = started(path, "--json", figures)
     spoil(path)
     left = path.read_bytes() if path.exists() else None
-    wait_for(lambda: recorded_cycles(second) > 300 or process.poll() is not None)
+    wait_for(lambda: recorded_cycles(second) > 300 or process.poll() is not None, pause=0.1)
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=30.0)
     assert process.returncode == 0, errors
