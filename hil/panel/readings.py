@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import viser
 
-from hil.panel.scene import COLORINGS, Machine, Scene
+from hil.look import COLORINGS, ESTIMATE, LENGTH, REFERENCE, ROOM, SPEED, TRUTH
+from hil.panel.scene import Machine, Scene
 from hil.runs.operator_messages import pose_in
 from plant.imu_wiring import PLATFORM_IMU
 from plant.pose import Pose, vector_from_rotation
@@ -53,13 +54,13 @@ def status(state: Mapping[str, Any]) -> str:
 
 def pose_table(state: Mapping[str, Any], frames: Mapping[str, Any]) -> str:
     """Estimate, reference and truth of {2} in {1}, and the tool in the work frame."""
-    named = [("estimate", state.get("pose")), ("reference", state.get("commanded")), ("truth", state.get("truth"))]
+    named = [(ESTIMATE, state.get("pose")), (REFERENCE, state.get("commanded")), (TRUTH, state.get("truth"))]
     if state.get("tool") and (frames["work"], frames["tool"]) != ("base", "platform"):
         named.append((f"{frames['tool']} in {frames['work']}", state["tool"]))
     rows = [(name, pose_in(pose)) for name, pose in named if pose]
     if not rows:
         return "no pose"
-    text = "| | x | y | z mm | rx | ry | rz deg |\n|---|--:|--:|--:|--:|--:|--:|\n"
+    text = "| | x | y | z [mm] | rx | ry | rz [deg] |\n|---|--:|--:|--:|--:|--:|--:|\n"
     return text + "".join(f"| {name} | {' | '.join(_pose_cells(pose))} |\n" for name, pose in rows)
 
 
@@ -81,7 +82,7 @@ def leg_table(state: Mapping[str, Any], machine: Machine) -> str:
     if "lengths" not in state:
         return ""
     lengths, room, rates = machine.lengths(state), machine.room(state), state["rates"]
-    text = "| leg | length | room mm | speed mm/s | of limit | IMU |\n|--:|--:|--:|--:|--:|:-:|\n"
+    text = f"| leg | {LENGTH} | {ROOM} | {SPEED} | of limit | IMU |\n|--:|--:|--:|--:|--:|:-:|\n"
     for leg in range(machine.legs):
         rate = float(rates[leg])
         used = "used" if leg in state["imus"] else "**out**"
