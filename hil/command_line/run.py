@@ -29,6 +29,7 @@ _NOTICED_STRETCH = 1.05
     # A resumed run keeps what its snapshot was taken with, and must tell what is given from what is not.
     cli.options_of(SimulationConfig, *cli.names_of(SimulationConfig, *OF_RUNS), only_given=True),
     cli.report("write a report with plots and a moving 3-D view"),
+    cli.output("--picture", "FILE.svg", "draw the mechanism in motion: a picture that moves without a script"),
     cli.JSON,
     cli.output("--save-state", "FILE", "write a snapshot, from which a run can go on"),
     cli.argument(
@@ -66,6 +67,10 @@ def gough_simulate(options: Namespace) -> None:
     if stopped is None or result.moved:
         cli.write_json(options.json, result.summary())
         cli.write_report(options, "run", result)
+        if options.picture is not None:
+            from hil.reports.moving_picture import write_picture
+
+            write_picture(result, options.picture)
         _print_simulation(result.summary())
     if stopped:
         raise stopped
