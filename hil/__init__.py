@@ -29,6 +29,12 @@ The best design within bounds, as `gough optimise` (docs/optimisation.md):
     with open_engine() as engine:
         print(optimise(read_design("design.toml"), Path("design.results"), engine).knee)
 
+Runs beside each other, as `gough compare` (docs/compare.md):
+
+    from hil import compare
+
+    print(compare(["before.json", "after.mcap"]).differing())
+
 Whatever refuses its input raises a `GoughError`. This package loads nothing until a name is used.
 """
 
@@ -43,6 +49,7 @@ if TYPE_CHECKING:
     from hil.realtime.scheduling import RealTimeSettings
     from hil.recording.replay import replay
     from hil.reports.run import write_report
+    from hil.runs.comparison import Comparison, compare
     from hil.runs.config import SimulationConfig
     from hil.runs.executive import RunStoppedError, run
     from hil.runs.run_state import RunState
@@ -59,11 +66,11 @@ if TYPE_CHECKING:
     from plant.mechanism import Mechanism, PlanarMechanism, load_mechanism
 
 __all__ = [
-    "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "OptimisationResult", "PlanarMechanism",
-    "RealTimeSettings", "RunState", "RunStoppedError", "Sampling", "Setting", "SimulationConfig", "SimulationResult",
-    "SimulationStoppedError", "Snapshot", "Study", "SweepResult", "UserFunction", "Wiring", "calibrate_recordings",
-    "calibrate_rig", "load_mechanism", "open_engine", "optimise", "read_design", "read_snapshot", "read_study", "replay", "run",
-    "run_study", "simulate", "write_report", "write_snapshot",
+    "Comparison", "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "OptimisationResult",
+    "PlanarMechanism", "RealTimeSettings", "RunState", "RunStoppedError", "Sampling", "Setting", "SimulationConfig",
+    "SimulationResult", "SimulationStoppedError", "Snapshot", "Study", "SweepResult", "UserFunction", "Wiring",
+    "calibrate_recordings", "calibrate_rig", "compare", "load_mechanism", "open_engine", "optimise", "read_design",
+    "read_snapshot", "read_study", "replay", "run", "run_study", "simulate", "write_report", "write_snapshot",
 ]  # fmt: skip
 
 _HOMES = {
@@ -74,6 +81,7 @@ _HOMES = {
     "hil.realtime.scheduling": ("RealTimeSettings",),
     "hil.recording.replay": ("replay",),
     "hil.reports.run": ("write_report",),
+    "hil.runs.comparison": ("Comparison", "compare"),
     "hil.runs.config": ("SimulationConfig",),
     "hil.runs.executive": ("RunStoppedError", "run"),
     "hil.runs.run_state": ("RunState",),
