@@ -31,7 +31,7 @@ _TOLERANCE, _SHADES = 0.25, 12.0
 """How far a drawn point may be off between keyframes [px], and what a share of a leg's colour counts then [px]."""
 _SAMPLES, _SAMPLE_RATE_HZ, _KEYFRAMES = 3000, 50.0, 300
 _CAPTIONS, _CAPTION_S = 60, 0.25
-"""The most captions, and how long each stays at least [s]."""
+"""The most captions, and about how long each stays [s] unless there would be more."""
 _ELEVATION = np.arctan(np.sqrt(0.5))
 _TUBE = 0.62
 """The drawn length of a leg's lower part, as a share of the leg's least length."""
@@ -252,11 +252,12 @@ def _captions(result: SimulationResult, course: _Course, clock: _Clock) -> Itera
     above = bottom - 18.0
     yield svg.text(_MARGIN, above, f"{result.mechanism.name} follows {result.target.name}")
     yield svg.text(_MARGIN, bottom, f"dashed: {REFERENCE}; legs turn from green to red near an end of their stroke")
-    count = int(np.clip(duration / _CAPTION_S, 1, _CAPTIONS))
+    count = int(np.clip(round(duration / _CAPTION_S), 1, _CAPTIONS))
     off = "estimate - truth" if result.truth_known else f"estimate - {REFERENCE}"
     for number in range(count):
         begin = number / count
-        error = 1e3 * course.errors[min(np.searchsorted(course.times, begin * duration), len(course.times) - 1)]
+        nearest = int(np.searchsorted(course.times, begin * duration))
+        error = 1e3 * course.errors[min(nearest, len(course.times) - 1)]
         text = svg.text(_WIDTH - _MARGIN, above, f"{begin * duration:.1f} s, {off} {error:.2f} mm", "end")
         yield clock.shown(text, begin, (number + 1) / count)
 
