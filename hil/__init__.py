@@ -30,6 +30,12 @@ The best design within bounds, as `gough optimise` (docs/optimisation.md):
     with open_engine() as engine:
         print(optimise(read_design("design.toml"), Path("design.results"), engine).knee)
 
+Runs beside each other, as `gough compare` (docs/compare.md):
+
+    from hil import compare
+
+    print(compare(["before.json", "after.mcap"]).differing())
+
 Whatever refuses its input raises a `GoughError`. This package loads nothing until a name is used.
 """
 
@@ -45,6 +51,7 @@ if TYPE_CHECKING:
     from hil.realtime.scheduling import RealTimeSettings
     from hil.recording.replay import replay
     from hil.reports.run import figures, write_report
+    from hil.runs.comparison import Comparison, compare
     from hil.runs.config import SimulationConfig
     from hil.runs.dataset import dataset, frame
     from hil.runs.executive import RunStoppedError, run
@@ -63,12 +70,12 @@ if TYPE_CHECKING:
     from plant.mechanism import Mechanism, PlanarMechanism, load_mechanism
 
 __all__ = [
-    "Cycle", "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "Operator", "OptimisationResult",
-    "PlanarMechanism", "RealTimeSettings", "RunState", "RunStoppedError", "Sampling", "Setting", "Simulation",
-    "SimulationConfig", "SimulationResult", "SimulationStoppedError", "Snapshot", "Stages", "Study", "SweepResult",
-    "UserFunction", "Wiring", "calibrate_recordings", "calibrate_rig", "dataset", "figures", "frame", "load_mechanism",
-    "open_engine", "open_simulation", "optimise", "read_design", "read_snapshot", "read_study", "replay", "run", "run_study",
-    "simulate", "write_report", "write_snapshot",
+    "Comparison", "Cycle", "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "Operator",
+    "OptimisationResult", "PlanarMechanism", "RealTimeSettings", "RunState", "RunStoppedError", "Sampling", "Setting",
+    "Simulation", "SimulationConfig", "SimulationResult", "SimulationStoppedError", "Snapshot", "Stages", "Study",
+    "SweepResult", "UserFunction", "Wiring", "calibrate_recordings", "calibrate_rig", "compare", "dataset", "figures", "frame",
+    "load_mechanism", "open_engine", "open_simulation", "optimise", "read_design", "read_snapshot", "read_study", "replay",
+    "run", "run_study", "simulate", "write_report", "write_snapshot",
 ]  # fmt: skip
 
 _HOMES = {
@@ -80,6 +87,7 @@ _HOMES = {
     "hil.realtime.scheduling": ("RealTimeSettings",),
     "hil.recording.replay": ("replay",),
     "hil.reports.run": ("figures", "write_report"),
+    "hil.runs.comparison": ("Comparison", "compare"),
     "hil.runs.config": ("SimulationConfig",),
     "hil.runs.dataset": ("dataset", "frame"),
     "hil.runs.executive": ("RunStoppedError", "run"),

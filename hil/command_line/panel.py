@@ -47,9 +47,10 @@ def gough_panel(options: Namespace) -> None:
     over = threading.Event()
     with signals_handled((signal.SIGINT, signal.SIGTERM), lambda number, frame: over.set()):
         if options.recording is not None:
-            from hil.panel.playback import Playback, recorded_run
+            from hil.panel.playback import Playback
+            from hil.runs.recorded_run import recorded_run
 
-            run = recorded_run(options.recording, options.mechanism)
+            run = recorded_run([options.recording], options.mechanism)
             server = open_server(host, port, token)
             _announce(options, host, port, token)
             Playback(server, run).run(over)

@@ -2,109 +2,18 @@
 
 import threading
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import viser
 
-from controller.frames import ActiveFrames, parse_frames
-from controller.imu_set import imus_of
-from controller.workspace import Demands
 from hil.panel.margins import MARGINS_S, MarginTable
 from hil.panel.readings import Readings, set_text, status
 from hil.panel.scene import Machine, Scene
-from hil.recording.mcap import read_run
-from hil.runs.operator_messages import pose_message
-from hil.runs.telemetry import (
-    estimated_pose,
-    frames_message,
-    machine_message,
-    margins_message,
-    reference_pose,
-    state_message,
-    timing_message,
-)
-from plant.compiled import Record
-from plant.errors import GoughError, InputError
-from plant.mechanism import Mechanism, load_in_space
+from hil.runs.recorded_run import RecordedRun
+from hil.runs.telemetry import frames_message, machine_message
 
 _FRAME_S = 1.0 / 30.0
-_EVENTS = 8
 _SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "5", "10")
-
-
-@dataclass(frozen=True, eq=False)
-class RecordedRun:
-    """A run as its files have it.
-
-    Attributes:
-        records: (N,), dtype `RECORD`.
-        period: of a cycle [s].
-        events: cycle and text of each, by cycle.
-        frames: of the run.
-        demands: what it asked of its poses.
-    """
-
-    mechanism: Mechanism
-    records: Record
-    period: float
-    events: Sequence[tuple[int, str]]
-    frames: ActiveFrames
-    demands: Demands
-
-    @property
-    def duration(self) -> float:
-        """From the first cycle to the last [s]."""
-        return float(self.records["cycle"][-1] - self.records["cycle"][0]) * self.period
-
-    def at(self, seconds: float) -> int:
-        """The record at a time since the first cycle [s]."""
-        cycle = self.records["cycle"][0] + seconds / self.period
-        return int(np.clip(np.searchsorted(self.records["cycle"], cycle, side="right") - 1, 0, len(self.records) - 1))
-
-    def state(self, index: int) -> dict[str, Any]:
-        """The state at a record, as a run tells it; its reference is `commanded`."""
-        record = self.records[index]
-        told = {"time": index * self.period, **state_message(record, self.frames)}
-        recent = np.arange(max(index - round(1.0 / self.period), 0), index + 1)
-        told["timing"] = timing_message(self.records, recent, self.period)
-        reference = reference_pose(record, self.mechanism)
-        return told if reference is None else told | {"commanded": pose_message(reference)}
-
-    def margins(self, index: int) -> list[dict[str, Any]]:
-        """How the pose stands to everything that limits it at a record; [] without a pose."""
-        pose = estimated_pose(self.records[index])
-        return [] if pose is None else margins_message(self.mechanism, pose, self.demands)
-
-    def told(self, index: int) -> list[str]:
-        """The last events until a record."""
-        cycle = int(self.records["cycle"][index])
-        return [f"cycle {at}: {text}" for at, text in self.events if at <= cycle][-_EVENTS:]
-
-
-def recorded_run(path: Path, mechanism: str | None = None) -> RecordedRun:
-    """Read a recording; `mechanism` takes the place of the recorded one, whose file may have moved.
-
-    Raises:
-        RecordingError: the file is no recording, or holds no cycle.
-        InputError: the mechanism cannot be loaded.
-    """
-    (recording,), records = read_run([path])
-    config = recording.config
-    named = config["mechanism"] if mechanism is None else mechanism
-    try:
-        loaded = load_in_space(named)
-    except GoughError as error:
-        raise InputError(f"the mechanism of the recording: {error}; name it with --mechanism") from None
-    defined = parse_frames(config.get("frame_definitions", ""), f"the frames in {path}")
-    demands = Demands(
-        imus=imus_of(loaded, config["imus"]), magnetometer=config["magnetometer"], section_5=config["fusion"] == "section-5"
-    )
-    period = 1.0 / float(config["rate"])
-    return RecordedRun(loaded, records, period, sorted(recording.events), ActiveFrames(defined), demands)
 
 
 class Playback:

@@ -7,7 +7,8 @@ import numpy as np
 import viser
 
 from controller.frames import BASE, PLATFORM, ActiveFrames, parse_frames
-from hil.panel.scene import COLORINGS, Machine, Scene
+from hil.look import COLORINGS, ESTIMATE, LENGTH, REFERENCE, ROOM, SPEED, TRUTH
+from hil.panel.scene import Machine, Scene
 from hil.runs.operator_messages import pose_in
 from plant.imu_wiring import PLATFORM_IMU
 from plant.pose import Pose, vector_from_rotation
@@ -67,11 +68,11 @@ def frames_to_choose(frames: Mapping[str, Any]) -> dict[str, ActiveFrames | None
 
 def pose_table(state: Mapping[str, Any], seen: ActiveFrames | None = None) -> str:
     """Estimate, reference and truth of a tool in a work frame; None for {2} in {1}."""
-    named = [("estimate", state.get("pose")), ("reference", state.get("commanded")), ("truth", state.get("truth"))]
+    named = [(ESTIMATE, state.get("pose")), (REFERENCE, state.get("commanded")), (TRUTH, state.get("truth"))]
     rows = [(name, pose_in(pose)) for name, pose in named if pose]
     if not rows:
         return "no pose"
-    text = "| | x | y | z mm | rx | ry | rz deg |\n|---|--:|--:|--:|--:|--:|--:|\n"
+    text = "| | x | y | z [mm] | rx | ry | rz [deg] |\n|---|--:|--:|--:|--:|--:|--:|\n"
     cells = [(name, _pose_cells(pose if seen is None else seen.read(pose))) for name, pose in rows]
     return text + "".join(f"| {name} | {' | '.join(numbers)} |\n" for name, numbers in cells)
 
@@ -94,7 +95,7 @@ def leg_table(state: Mapping[str, Any], machine: Machine) -> str:
     if "lengths" not in state:
         return ""
     lengths, room, rates = machine.lengths(state), machine.room(state), state["rates"]
-    text = "| leg | length | room mm | speed mm/s | of limit | IMU |\n|--:|--:|--:|--:|--:|:-:|\n"
+    text = f"| leg | {LENGTH} | {ROOM} | {SPEED} | of limit | IMU |\n|--:|--:|--:|--:|--:|:-:|\n"
     for leg in range(machine.legs):
         rate = float(rates[leg])
         used = "used" if leg in state["imus"] else "**out**"

@@ -64,8 +64,12 @@ class RunState:
         """Add the cycles that the loop has recorded meanwhile; returns whether there are any."""
         records, self._seen, unseen = take(records, link, self._seen)
         self.unseen += unseen
-        if not len(records):
-            return False
+        if len(records):
+            self.add(records)
+        return len(records) > 0
+
+    def add(self, records: Record) -> None:
+        """Add cycles (n,), dtype `RECORD`, one at least."""
         self.latest = records[-1]
         self.timing.add(records)
         self.missed += int(records["missed"].sum())
@@ -88,7 +92,6 @@ class RunState:
                 arms = (known["rotation"] - rotations) @ self.frames.tool.position
                 self._tool_squares += float(np.sum((off[:, :3] + arms) ** 2))
         self._counts += (len(known), len(posed))
-        return True
 
     def level(self) -> dict[str, float] | None:
         """The greatest protection level of the motion, `position` [m] and `rotation` [rad]; None if there was none."""

@@ -164,6 +164,7 @@ class SimulationResult:
             frames = {"frames": {**described, "protection": _protection(levels @ arm.T, of_tool)}}
         return {
             "truth_known": self.truth_known,
+            "motion_s": int(moving.sum()) / self.config.rate,
             **_errors(**of_platform),
             **frames,
             "protection": _protection(levels, of_platform),
