@@ -2,6 +2,7 @@
 
 import re
 import sys
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ DOCS = Path(__file__).parent
 sys.path[:0] = [str(DOCS.parent), str(DOCS / "_ext")]
 
 from hil import reference  # noqa: E402
+from hil.reference.fields import declared  # noqa: E402
 
 project = "gough"
 author = "the authors of gough"
@@ -57,7 +59,23 @@ def link_by_last_name(_app: Sphinx, env: BuildEnvironment, node: pending_xref, t
     return None if name.partition(".")[0] in OWN_PACKAGES else text
 
 
+def read_docstring(_app: Sphinx, what: str, _name: str, of: Any, _options: Any, lines: list[str]) -> None:
+    """Docstrings are plain: an indented paragraph is code or a formula, and a field's meaning stands in a comment behind it."""
+    found: list[str] = []
+    for line in lines:
+        before = next((each for each in reversed(found) if each.strip()), "")
+        if line.startswith("    ") and found and not found[-1].strip() and before[:1] not in ("", " "):
+            found += ["::", ""]
+        found.append(line)
+    if what == "class" and is_dataclass(of) and "Attributes:" not in found:
+        texts = declared(of)[1]
+        described = [f"    {each.name}: {texts[each.name]}" for each in fields(of) if each.name in texts]
+        found += ["Attributes:", *described, ""] if described else []
+    lines[:] = found
+
+
 def setup(app: Sphinx) -> None:
-    """Connect the two functions above."""
+    """Connect the functions above; docstrings are read before napoleon reads their sections."""
     app.connect("source-read", put_in_tables)
     app.connect("missing-reference", link_by_last_name)
+    app.connect("autodoc-process-docstring", read_docstring, priority=400)

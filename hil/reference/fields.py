@@ -62,7 +62,7 @@ def entries_of(kind: Any, limits: Mapping[str, str] | None = None, without: Sequ
         without: fields that a file does not have.
         own: meanings of fields, where the class itself says nothing of them.
     """
-    types, texts = _declared(kind)
+    types, texts = declared(kind)
     found = []
     for each in fields(kind):
         if each.name not in without:
@@ -96,7 +96,7 @@ def _plain_part(part: str) -> str:
 
 
 @cache
-def _declared(kind: type) -> tuple[dict[str, str], dict[str, str]]:
+def declared(kind: type) -> tuple[dict[str, str], dict[str, str]]:
     """The types of a dataclass's fields, and what the class and those that it inherits from say of them."""
     types: dict[str, str] = {}
     texts: dict[str, str] = {}
