@@ -1,4 +1,4 @@
-# make demo | test | test-all | test-endurance | bench | lint: each sets up what it needs in .venv first.
+# make demo | test | test-all | test-endurance | bench | lint | docs: each sets up what it needs in .venv first.
 SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
@@ -18,7 +18,7 @@ define install
 	clock=$$!; trap "kill $$clock" EXIT; $(BIN)/pip install --quiet --constraint constraints.txt --editable '$(1)'
 endef
 
-.PHONY: demo test test-all test-endurance bench bench-loop bench-fusion bench-faults lint clean
+.PHONY: demo test test-all test-endurance bench bench-loop bench-fusion bench-faults lint docs docs-links clean
 .DELETE_ON_ERROR:
 
 demo: .venv/installed
@@ -32,8 +32,8 @@ test test-all test-endurance: export OPENBLAS_NUM_THREADS = 1
 test: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "not slow and not endurance"
 
-test-all: .venv/installed-test
-	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "not endurance" --hypothesis-profile=all --durations=25
+test-all: test
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "slow or hypothesis" --hypothesis-profile=all --durations=25
 
 test-endurance: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m endurance
@@ -59,6 +59,15 @@ lint: .venv/installed-lint
 	$(BIN)/mypy --strict
 	$(BIN)/lint-imports
 
+docs: .venv/installed-docs
+	@mkdir -p $(OUT)
+	$(BIN)/sphinx-build -n -W --keep-going -q -E docs $(OUT)/docs
+	@echo "Open $(OUT)/docs/index.html in a browser."
+
+# The links to the outside: needs the network.
+docs-links: .venv/installed-docs
+	$(BIN)/sphinx-build -q -E -b linkcheck docs $(OUT)/links
+
 clean:
 	rm -rf .venv build dist $(OUT) *.egg-info
 
@@ -83,4 +92,8 @@ clean:
 
 .venv/installed-lint: .venv/installed-test
 	$(call install,.[test$(comma)lint])
+	@touch $@
+
+.venv/installed-docs: .venv/installed-all
+	$(call install,.[docs])
 	@touch $@

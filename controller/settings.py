@@ -42,20 +42,24 @@ class _Settings:
             if value == inf and endless:
                 continue
             if not 0.0 <= value < inf or (value == 0.0 and not zero):
-                sign = "0 or positive" if zero else "positive"
-                allowed = f"{sign}; inf is no limit" if endless else f"{sign} and finite"
-                raise InputError(f"{field.name} is {value}; it must be {allowed}")
+                raise InputError(f"{field.name} is {value}; it must be {self.allowed(field.name)}")
+
+    @staticmethod
+    def allowed(name: str) -> str:
+        """Which values a setting may have, in words."""
+        sign = "0 or positive" if name in _ZERO_ALLOWED else "positive"
+        return f"{sign}; inf is no limit" if name in _ENDLESS_ALLOWED else f"{sign} and finite"
 
 
 @dataclass(frozen=True)
 class ControlSettings(_Settings):
     """Gains of the six PID controllers, designed by `controller.design.tuning`, and the time at which feedback closes."""
 
-    proportional: float = 60.0  # gain [1/s]
-    integral: float = 200.0  # gain [1/s^2]
-    derivative: float = 0.0  # gain [-]
+    proportional: float = 60.0  # gain on the deviation of a length [1/s]
+    integral: float = 200.0  # gain on its integral [1/s^2]
+    derivative: float = 0.0  # gain on its derivative [-]
     derivative_bandwidth: float = 100.0  # corner of the derivative's low-pass [rad/s]
-    hold: float = 0.2  # for which the brakes hold while the estimate settles [s]
+    hold: float = 0.2  # so long the brakes hold while the estimate settles [s]
     command_reserve: float = 1.4  # largest command, as a multiple of the actuators' velocity limit
     position_proportional: float = 15.0  # instead of `proportional` where drives close position loops [1/s]
     position_integral: float = 10.0  # instead of `integral` [1/s^2]
@@ -79,12 +83,12 @@ class FusionSettings(_Settings):
     leg_jerk: float = 100.0  # density of the legs' angular jerk [rad/s^3/sqrt(Hz)]
     bias_walk: float = 3.2e-5  # of the gyroscopes' biases [rad/s/sqrt(s)]
     bias_sigma: float = radians(0.4)  # of a gyroscope's bias at the start [rad/s]
-    gyroscope_noise: float = radians(0.005)  # density [rad/s/sqrt(Hz)]
-    leg_accelerometer_noise: float = 0.018  # density [m/s^2/sqrt(Hz)]
-    platform_accelerometer_noise: float = 0.0134  # density [m/s^2/sqrt(Hz)]
+    gyroscope_noise: float = radians(0.005)  # of the gyroscopes, density [rad/s/sqrt(Hz)]
+    leg_accelerometer_noise: float = 0.018  # of the legs' accelerometers, density [m/s^2/sqrt(Hz)]
+    platform_accelerometer_noise: float = 0.0134  # of the platform's accelerometer, density [m/s^2/sqrt(Hz)]
     leg_sigma: float = radians(0.06)  # of each component of a leg's direction, for the refinement [rad]
     tilt_sigma: float = radians(0.06)  # of the platform's roll and pitch, for the refinement [rad]
-    magnetometer_noise: float = 0.052  # density, including that of its resolution [uT/sqrt(Hz)]
+    magnetometer_noise: float = 0.052  # of the magnetometers, density, including that of its resolution [uT/sqrt(Hz)]
     magnetometer_rate: float = 100.0  # samples per second; between samples the last one is repeated [Hz]
     heading_sigma: float = radians(1.0)  # of the heading that its calibration leaves, for the refinement [rad]
     acceleration_time: float = 0.01  # time constant of the platform's acceleration, the derivative of its twist [s]
@@ -96,26 +100,25 @@ class FusionSettings(_Settings):
     length_play: float = 1e-5  # what play and steps leave of it for a while [m]
     length_zero: float = 0.05  # of an encoder's zero at the start [m]
     # For the whole-mechanism filter, the noise with calibrated IMUs.
-    platform_jerk: float = 6.0  # density [m/s^3/sqrt(Hz)]
-    platform_angular_jerk: float = 35.0  # density [rad/s^3/sqrt(Hz)]
-    mechanism_gyroscope_noise: float = radians(0.0042)  # density [rad/s/sqrt(Hz)]
-    mechanism_accelerometer_noise: float = 0.004  # density [m/s^2/sqrt(Hz)]
-    accelerometer_bias_walk: float = 1e-5  # [m/s^2/sqrt(s)]
+    platform_jerk: float = 6.0  # of the platform, density [m/s^3/sqrt(Hz)]
+    platform_angular_jerk: float = 35.0  # of the platform, density [rad/s^3/sqrt(Hz)]
+    mechanism_gyroscope_noise: float = radians(0.0042)  # of calibrated gyroscopes, density [rad/s/sqrt(Hz)]
+    mechanism_accelerometer_noise: float = 0.004  # of calibrated accelerometers, density [m/s^2/sqrt(Hz)]
+    accelerometer_bias_walk: float = 1e-5  # of the accelerometers' biases [m/s^2/sqrt(s)]
     # For IMUs without a calibration file, which have errors that the filter does not estimate.
-    accelerometer_bias_sigma: float = 0.015  # [m/s^2]
-    scale_sigma: float = 1e-3  # [1]
-    alignment_sigma: float = radians(0.1)  # [rad]
-    axes_sigma: float = 1e-3  # [rad]
+    accelerometer_bias_sigma: float = 0.015  # of an accelerometer's bias [m/s^2]
+    scale_sigma: float = 1e-3  # of a scale [1]
+    alignment_sigma: float = radians(0.1)  # of an angle of the mounting [rad]
+    axes_sigma: float = 1e-3  # of an angle between axes [rad]
     noise_inflation: float = 2.75  # factor on the whole-mechanism filter's noises and the platform's jerk
-    # RMS angle between the leg filters' directions and the whole-mechanism filter's pose that ends the use of that pose [rad].
-    disagreement: float = radians(1.0)
+    disagreement: float = radians(1.0)  # RMS of it with the leg filters' directions, beyond which its pose is not used [rad]
 
 
 @dataclass(frozen=True)
 class SafetySettings(_Settings):
     """Limits that are checked while the loop runs."""
 
-    most_lost_imus: float = 1.0  # that may be left out at once
+    most_lost_imus: float = 1.0  # so many may be left out at once
     disagreement: float = radians(1.0)  # of an IMU's direction and that of all others, beyond which it is left out [rad]
     misfit: float = 5.0  # RMS of what a pose leaves of the IMUs' directions without the worst, beyond which a run stops [sigma]
     evidence: float = 8.0  # that something is wrong with the readings, beyond which an IMU is left out or a run stops [sigma]

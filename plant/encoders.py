@@ -67,7 +67,7 @@ An absolute encoder sits at the rod, has no play and a zero that its maker has s
 
 NO_LENGTHS = "none"
 
-_WORDS = {
+WORDS = {
     "resolution_um": ("resolution", 1e-6),
     "backlash_um": ("backlash", 1e-6),
     "noise_um": ("noise", 1e-6),
@@ -94,11 +94,11 @@ def load_encoder(name: str) -> EncoderModel | None:
         known = (NO_LENGTHS, *PRESETS)
         raise UnknownNameError(f"no encoder {name!r}; there are {', '.join(known)}, or a TOML file{nearest(name, known)}")
     table = read_toml(name)
-    check_entries(table, ("based_on", "absolute", "switches_m", *_WORDS), name)
+    check_entries(table, ("based_on", "absolute", "switches_m", *WORDS), name)
     base = load_encoder(table.get("based_on", "incremental"))
     if base is None:
         raise InputError(f"{name} is based on no encoder: leave based_on out, or name incremental or absolute")
-    changes: dict[str, Any] = {field: _number(table, word, name) * by for word, (field, by) in _WORDS.items() if word in table}
+    changes: dict[str, Any] = {field: _number(table, word, name) * by for word, (field, by) in WORDS.items() if word in table}
     if "absolute" in table:
         if not isinstance(table["absolute"], bool):
             raise InputError(f"absolute of {name} is {table['absolute']!r}; it must be true or false")
@@ -113,7 +113,7 @@ def load_encoder(name: str) -> EncoderModel | None:
 
 def text_of_encoder(model: EncoderModel) -> str:
     """The TOML text of a kind of encoder, which `load_encoder` reads again, to rounding."""
-    words = {word: getattr(model, field) / by for word, (field, by) in _WORDS.items()}
+    words = {word: getattr(model, field) / by for word, (field, by) in WORDS.items()}
     switches = [float(each) for each in model.switches]
     return "\n".join(toml_entries({"absolute": model.absolute, "switches_m": switches, **words})) + "\n"
 

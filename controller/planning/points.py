@@ -13,6 +13,8 @@ from plant.files import parse_toml, read_text
 HOME = "home"
 """The point that is always there: the mechanism's home."""
 
+_FRAMES = ("frame", "tool")
+
 
 @dataclass(frozen=True)
 class Point:
@@ -43,11 +45,11 @@ def load_points(path: str | Path) -> dict[str, Point]:
         if not isinstance(table, Mapping):
             raise InputError(f"{title} is {table!r}; it must be a table")
         where = dict(table)
-        frames = {each: where.pop(each, None) for each in ("frame", "tool")}
+        frames = {each: where.pop(each, None) for each in _FRAMES}
         for each, given in frames.items():
             if given is not None and not isinstance(given, str):
                 raise InputError(f"{title}: {each} is {given!r}; it must be a text in quotes")
-        points[name] = Point(place_of(where, title), **frames)
+        points[name] = Point(place_of(where, title, _FRAMES), **frames)
     return points
 
 

@@ -108,6 +108,14 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     return options
 
 
+def parser_of(name: str) -> argparse.ArgumentParser:
+    """The parser of a command by itself."""
+    (heading,) = (each for each, names in COMMANDS.items() if name in names)
+    parser = _Parser(prog=f"gough {name}")
+    _command(heading, name).build(parser)
+    return parser
+
+
 def _command(heading: str, name: str) -> Command:
     """A command, imported only here."""
     module = import_module(f"hil.command_line.{heading}")

@@ -64,7 +64,7 @@ WRITTEN = (COMMANDS, MODES, PAYLOAD, *BASE)
 READ_GROUPS = ("sensed", "known", "encoded", "base_sensed")
 """The groups of scalars that the loop reads, as `Bound` has them."""
 
-_MODE_NAMES = tuple(DRIVE_MODES.values())
+MODE_NAMES = tuple(DRIVE_MODES.values())
 _ENTRIES = ("offset", "sign", "unit", "variables")
 
 LEAST_STEP_S = 1e-6
@@ -125,7 +125,7 @@ def text_of_binding(binding: Binding) -> str:
     }
     for name, signal in ({} if binding.native else binding.signals).items():
         entries: dict[str, Any] = {"variables": signal.variables, "unit": signal.unit, "imus": signal.imus}
-        entries |= dict(zip(_MODE_NAMES, signal.modes, strict=True)) if name == MODES else {}
+        entries |= dict(zip(MODE_NAMES, signal.modes, strict=True)) if name == MODES else {}
         entries |= {"sign": signal.sign, "offset": signal.offset} if name != MODES else {}
         tables[name] = {entry: value for entry, value in entries.items() if value is not None}
     return "\n".join(line for name, entries in tables.items() for line in (f"[{json.dumps(name)}]", *toml_entries(entries), ""))
@@ -151,7 +151,7 @@ class _Reader:
         return float(step) if good and step is not None else None
 
     def signal(self, name: str, table: Mapping[str, Any]) -> SignalBinding:
-        entries = _ENTRIES if name != MODES else ("variables", *_MODE_NAMES)
+        entries = _ENTRIES if name != MODES else ("variables", *MODE_NAMES)
         self.problems += unknown_entries(table, ("imus", *entries) if name in IMU_SIGNALS else entries, f"[{name}]")
         variables = table.get("variables", [])
         if isinstance(variables, str):
@@ -170,7 +170,7 @@ class _Reader:
             sign if signs else (1.0,),
             self._numbers(name, "offset", table.get("offset", 0.0)),
             self._imus(name, table.get("imus")),
-            tuple(self._mode(name, mode, table.get(mode)) for mode in _MODE_NAMES),
+            tuple(self._mode(name, mode, table.get(mode)) for mode in MODE_NAMES),
         )
 
     def _check(self, name: str, entry: str, value: Any, good: Any, needed: str) -> None:

@@ -91,6 +91,12 @@ IMU_WORDS = {
 """The words of a data sheet for the whole IMU: the field of `ImuModel`, and its units."""
 
 
+def words_for(sensor: str) -> dict[str, tuple[str, list[str]]]:
+    """The words of a data sheet for a sensor, each with the field that it gives and its units; `bits` has none."""
+    found = {word: (entry.field, [*map(_shown, entry.units(sensor))]) for word, entry in _WORDS.items()}
+    return {word: (field, units) for word, (field, units) in found.items() if units} | {"bits": ("resolution", [])}
+
+
 def figure(text: Any, units: Mapping[str, float], title: str) -> float:
     """The figure of a text such as "160 ug/sqrt(Hz)" in SI units; a unit with a negative factor stands for its inverse.
 

@@ -12,7 +12,7 @@ import numpy as np
 from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries, parse_toml, read_toml, toml_entries
-from plant.imu.data_sheet import IMU_WORDS, SENSOR_WORDS, figure, sensor_of_words
+from plant.imu.data_sheet import IMU_WORDS, SENSOR_WORDS, figure, sensor_of_words, words_for
 from plant.imu.model import MILLI_G, MOST_SECTIONS, STANDARD_GRAVITY, ImuModel, SensorErrors
 from plant.imu_disturbances import SENSORS, disturbance, disturbance_of_table, words_of
 
@@ -113,7 +113,7 @@ def _nominal(model: ImuModel) -> ImuModel:
     )
 
 
-_GRADES: dict[str, Callable[[ImuModel], ImuModel]] = {
+GRADES: dict[str, Callable[[ImuModel], ImuModel]] = {
     "raw": lambda model: model,
     "calibrated": _calibrated,
     "nominal": _nominal,
@@ -148,7 +148,7 @@ def load_imu(name: str) -> ImuModel:
     return imu_of_table(read_toml(name), Path(name).stem, name)
 
 
-_WORDS = {
+WORDS = {
     "magnetometer_rate_hz": ("magnetometer_rate", 1.0),
     "misalignment_deg": ("misalignment", radians(1.0)),
     "delay_ms": ("delay", 1e-3),
@@ -161,7 +161,8 @@ _WORDS = {
 """The words of an IMU's file: the field, and the factor to its unit."""
 
 
-def _sensor_words(unit: str, factor: float) -> dict[str, tuple[str, float]]:
+def sensor_words(unit: str, factor: float) -> dict[str, tuple[str, float]]:
+    """The words of a sensor in its file: the field, and the factor to its unit."""
     return {
         f"noise_{unit}_per_root_hz": ("noise", factor),
         f"bias_{unit}": ("bias", factor),
@@ -179,7 +180,7 @@ def _sensor_words(unit: str, factor: float) -> dict[str, tuple[str, float]]:
     }
 
 
-_UNITS = {"gyroscope": ("deg_per_s", radians(1.0)), "accelerometer": ("m_per_s2", 1.0), "magnetometer": ("ut", 1.0)}
+UNITS = {"gyroscope": ("deg_per_s", radians(1.0)), "accelerometer": ("m_per_s2", 1.0), "magnetometer": ("ut", 1.0)}
 _PAIRS = ("bias", "bias_per_kelvin", "scale_per_kelvin", "bias_per_volt")
 
 
@@ -192,18 +193,18 @@ def imu_of_table(table: Mapping[str, Any], name: str, title: str) -> ImuModel:
         GoughError: an entry is unknown or out of range, figures contradict each other, or a data sheet's lacks one.
     """
     check_entries(
-        table, ("based_on", "grade", "low_passes_hz", "low_pass", "disturbances", *IMU_WORDS, *_WORDS, *SENSORS), title
+        table, ("based_on", "grade", "low_passes_hz", "low_pass", "disturbances", *IMU_WORDS, *WORDS, *SENSORS), title
     )
     model = _of_data_sheet(table, load_imu(table.get("based_on", "ideal")), title)
     if "low_pass" in table:
         model = _with_low_pass(model, table["low_pass"], title)
     if "grade" in table:
-        if table["grade"] not in _GRADES:
-            raise InputError(f"grade of {title} is {table['grade']!r}; it must be one of {', '.join(_GRADES)}")
-        model = _GRADES[table["grade"]](model)
-    changes = _values({word: value for word, value in table.items() if word in _WORDS}, _WORDS, title)
+        if table["grade"] not in GRADES:
+            raise InputError(f"grade of {title} is {table['grade']!r}; it must be one of {', '.join(GRADES)}")
+        model = GRADES[table["grade"]](model)
+    changes = _values({word: value for word, value in table.items() if word in WORDS}, WORDS, title)
     for sensor in (sensor for sensor in SENSORS if sensor in table):
-        words = _sensor_words(*_UNITS[sensor])
+        words = sensor_words(*UNITS[sensor])
         single = {word: value for word, value in table[sensor].items() if word in words}
         changes[sensor] = replace(getattr(model, sensor), **_values(single, words, f"[{sensor}] of {title}"))
     if "disturbances" in table:
@@ -218,11 +219,11 @@ def text_of_imu(model: ImuModel) -> str:
         {
             "based_on": _MPU9150.name if model.sparing else "ideal",
             "low_passes_hz": model.low_passes,
-            **_entries(model, _WORDS),
+            **_entries(model, WORDS),
         }
     )
     for sensor in SENSORS:
-        lines += ["", f"[{sensor}]", *toml_entries(_entries(getattr(model, sensor), _sensor_words(*_UNITS[sensor])))]
+        lines += ["", f"[{sensor}]", *toml_entries(_entries(getattr(model, sensor), sensor_words(*UNITS[sensor])))]
     for each in model.disturbances:
         lines += ["", "[[disturbances]]", *toml_entries(words_of(each))]
     return "\n".join(lines) + "\n"
@@ -239,11 +240,11 @@ def _of_data_sheet(table: Mapping[str, Any], model: ImuModel, title: str) -> Imu
     changes: dict[str, Any] = {}
     for word, (field, units) in IMU_WORDS.items():
         if word in table:
-            _refuse_both(table, word, _WORDS, field, title)
+            _refuse_both(table, word, WORDS, field, title)
             changes[field] = figure(table[word], units, f"{word} of {title}")
     for sensor in (sensor for sensor in SENSORS if sensor in table):
-        words, where = _sensor_words(*_UNITS[sensor]), f"[{sensor}] of {title}"
-        check_entries(table[sensor], (*words, *SENSOR_WORDS), where)
+        words, where = sensor_words(*UNITS[sensor]), f"[{sensor}] of {title}"
+        check_entries(table[sensor], (*words, *words_for(sensor)), where)
         if not any(word in SENSOR_WORDS for word in table[sensor]):
             continue
         for word, field in SENSOR_WORDS.items():
@@ -324,4 +325,4 @@ def _parts() -> Iterator[ImuModel]:
         yield imu_of_table(parse_toml(file.read_text(encoding="utf-8"), file.name), Path(file.name).stem, file.name)
 
 
-PRESETS |= {model.name: model for part in _parts() for model in (grade(part) for grade in _GRADES.values())}
+PRESETS |= {model.name: model for part in _parts() for model in (grade(part) for grade in GRADES.values())}

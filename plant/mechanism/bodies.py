@@ -13,9 +13,9 @@ from plant.errors import InputError
 from plant.files import check_entries
 from plant.pose import Array, checked_array, checked_unit, numbers
 
-_MOST_M = 1.0
+MOST_M = 1.0
 """The largest plausible diameter, thickness and clearance."""
-_LARGEST_PLATE_M = 10.0
+LARGEST_PLATE_M = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +159,7 @@ def _plate(table: Any, name: str, planar: bool) -> Plate:
     center = _vectors([table["center"]], 1, f"{name}.center", planar)[0]
     normal = _vectors([table.get("normal", (0.0, 0.0, 1.0))], 1, f"{name}.normal", planar)[0]
     radius, thickness = (float(checked_array(table.get(each, 0.0), (), f"{name}.{each}")) for each in ("radius", "thickness"))
-    _check_size(f"{name}.radius", radius, 0.0, _LARGEST_PLATE_M)
+    _check_size(f"{name}.radius", radius, 0.0, LARGEST_PLATE_M)
     _check_size(f"{name}.thickness", thickness)
     return Plate(center, checked_unit(normal, 3, f"{name}.normal"), radius, thickness)
 
@@ -176,7 +176,7 @@ def _vectors(value: Any, count: int, name: str, planar: bool) -> Array:
     return np.pad(rows, ((0, 0), (0, 3 - rows.shape[1])))
 
 
-def _check_size(name: str, size: float, least: float | None = None, most: float = _MOST_M) -> None:
+def _check_size(name: str, size: float, least: float | None = None, most: float = MOST_M) -> None:
     """Check that a size [m] is at least 0, or more than `least`, and not in another unit."""
     if (size < 0.0 if least is None else size <= least) or size > most:
         raise InputError(

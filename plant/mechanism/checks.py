@@ -90,7 +90,7 @@ def _table(content: dict[str, Any]) -> MappingProxyType[str, Any]:
 copyreg.pickle(MappingProxyType, lambda table: (_table, (dict(table),)))
 
 
-_MOST = {"velocity": (10.0, "m/s"), "acceleration": (1e4, "m/s2"), "jerk": (1e8, "m/s3"), "stop_clearance": (1.0, "m")}
+MOST_LIMITS = {"velocity": (10.0, "m/s"), "acceleration": (1e4, "m/s2"), "jerk": (1e8, "m/s3"), "stop_clearance": (1.0, "m")}
 """The largest plausible limits, and their units."""
 
 
@@ -103,9 +103,9 @@ class Limits:
     """
 
     stroke: Array  # (n, 2), least and greatest length of each leg [m]
-    velocity: float = 0.25  # [m/s]
-    acceleration: float = 3.0  # [m/s^2]
-    jerk: float = 60.0  # [m/s^3]
+    velocity: float = 0.25  # of each leg [m/s]
+    acceleration: float = 3.0  # of each leg [m/s^2]
+    jerk: float = 60.0  # of each leg [m/s^3]
     stop_clearance: float = 0.002  # from the stroke to the plant's end stops [m]
 
     def __post_init__(self) -> None:
@@ -122,7 +122,7 @@ class Limits:
             object.__setattr__(self, name, value)
             if value <= 0.0:
                 raise InputError(f"the limit of {name} is {value:g}; it must be positive")
-            most, unit = _MOST[name]
+            most, unit = MOST_LIMITS[name]
             if value > most:
                 raise InputError(f"the limit of {name} is {value:g} {unit}; no leg has more than {most:g}: give it in {unit}")
 

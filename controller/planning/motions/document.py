@@ -57,13 +57,13 @@ def load_washout(path: str | Path) -> Washout:
     return _made(Washout, _in_radians(parse_toml(read_text(path), name), name), name)
 
 
-def place_of(table: Any, title: str) -> Place:
-    """The place of a table, which messages call `title`.
+def place_of(table: Any, title: str, also: Iterable[str] = ()) -> Place:
+    """The place of a table, which messages call `title`; they list what the table may have, and `also` besides.
 
     Raises:
         InputError: it is no place.
     """
-    return _Reader(Path()).place(table, title)
+    return _Reader(Path()).place(table, title, also)
 
 
 def text_of_motion(motion: Motion) -> str:
@@ -153,8 +153,8 @@ class _Reader:
             **{name: lambda value, name=name: self.place(value, f"{title}, {name}") for name in _PLACES},
         )  # fmt: skip
 
-    def place(self, given: Any, title: str) -> Place:
-        """The place of a table, or of a point's name."""
+    def place(self, given: Any, title: str, also: Iterable[str] = ()) -> Place:
+        """The place of a table, or of a point's name; `also` as in `place_of`."""
         if isinstance(given, str):
             if given not in self._points:
                 there = f"there are {', '.join(self._points)}" if self._points else "there is no table [points]"
@@ -170,20 +170,22 @@ class _Reader:
                 raise InputError(f"{title}: {error}") from None
             table["rotation"] = tuple(vector_from_rotation(turned).tolist())
         if isinstance(table.get("relative", False), bool):
-            return _made(Place, table, title, also=("quaternion",))
+            return _made(Place, table, title, also=("quaternion", *also))
         raise InputError(f"{title}: relative is {table['relative']!r}; it must be true or false")
 
     def _spline_point(self, given: Any, title: str) -> SplinePoint:
         if isinstance(given, str):
             return SplinePoint(self.place(given, title))
         table = _in_radians(_table(given, title), title)
+        own = [each.name for each in fields(SplinePoint) if each.name != "place"]
+        check_entries(table, ["point", *_PLACE, *own], title)
         where: Any = {name: table.pop(name) for name in _PLACE if name in table}
         if "point" in table:
             if where:
                 raise InputError(f"{title} names a point and has {next(iter(where))}: give one of them")
             where = table.pop("point")
         table["place"] = self.place(where, title)
-        return _made(SplinePoint, table, title, also=("point", *_PLACE))
+        return _made(SplinePoint, table, title)
 
     def _wave(self, given: dict[str, Any], title: str) -> AnyWave:
         shape = given.get("shape")

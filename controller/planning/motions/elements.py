@@ -38,12 +38,12 @@ _LARGEST_STEP = np.radians(120.0)
 class ToolLimits:
     """What the tool, the origin of {2}, may do: the rest of it is up to the actuators."""
 
-    speed: float = inf  # [m/s]
-    acceleration: float = inf  # [m/s^2]
-    jerk: float = inf  # [m/s^3]
-    turn_speed: float = inf  # [rad/s]
-    turn_acceleration: float = inf  # [rad/s^2]
-    turn_jerk: float = inf  # [rad/s^3]
+    speed: float = inf  # greatest [m/s]
+    acceleration: float = inf  # greatest, along the way and across [m/s^2]
+    jerk: float = inf  # greatest [m/s^3]
+    turn_speed: float = inf  # greatest, of the orientation [rad/s]
+    turn_acceleration: float = inf  # likewise [rad/s^2]
+    turn_jerk: float = inf  # likewise [rad/s^3]
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -240,7 +240,7 @@ class SplinePoint:
 
     place: Place
     time: float | None = None  # since the element begins [s]
-    velocity: Numbers | None = None  # (3,) [m/s]
+    velocity: Numbers | None = None  # (3,), there [m/s]
     turn_velocity: Numbers | None = None  # (3,), angular velocity [rad/s]; 0 if only the velocity is given
 
 

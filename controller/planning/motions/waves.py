@@ -78,7 +78,7 @@ class Sine:
     """A sine on an axis."""
 
     axis: str
-    amplitude: float  # [m], on a turn [rad]
+    amplitude: float  # at its peaks, on a turn an angle [m or rad]
     frequency: float  # [Hz]
     phase: float = 0.0  # at the beginning [rad]
 
@@ -103,7 +103,7 @@ class Chirp:
     """A sine whose frequency goes from one to another within `duration`, by the same factor in the same time."""
 
     axis: str
-    amplitude: float  # [m], on a turn [rad]
+    amplitude: float  # at its peaks, on a turn an angle [m or rad]
     from_frequency: float  # [Hz]
     to_frequency: float  # [Hz]
     duration: float  # [s]; then the frequency stays
@@ -134,7 +134,7 @@ class Circle:
     """A circle about where the wave begins, in the plane of two axes."""
 
     axes: tuple[str, str]
-    radius: float  # [m], of turns [rad]
+    radius: float  # of turns an angle [m or rad]
     frequency: float  # turns per second [Hz]
 
     def __post_init__(self) -> None:
@@ -158,7 +158,7 @@ class FigureEight:
     """A figure eight through where the wave begins: the second axis goes to and fro twice as often as the first."""
 
     axes: tuple[str, str]
-    amplitudes: tuple[float, float]  # [m], of turns [rad]
+    amplitudes: tuple[float, float]  # at its peaks, of turns angles [m or rad]
     frequency: float  # of the whole figure [Hz]
 
     def __post_init__(self) -> None:
@@ -185,7 +185,7 @@ class Noise:
     """Noise within a band: sines of random phase and of amplitudes that are alike, spread evenly over the band."""
 
     axis: str
-    rms: float  # root mean square [m], on a turn [rad]
+    rms: float  # root mean square, on a turn of an angle [m or rad]
     from_frequency: float  # [Hz]
     to_frequency: float  # [Hz]
     seed: int = 0

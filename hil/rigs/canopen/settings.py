@@ -36,47 +36,50 @@ COMMAND_BYTES, ANSWER_BYTES, FD_BYTES = 6, 8, 32
 _LONGEST_TIME = 65.535
 _INT32 = 2**31 - 1
 
-Check = Callable[[str, Any], None]
-"""Takes an entry's name and value, and raises an `InputError` if the value cannot be used."""
+
+@dataclass(frozen=True)
+class Check:
+    """What the value of an entry must be; a call with the entry's name and value raises an `InputError` if it is not."""
+
+    hold: Callable[[Any], bool]
+    text: str
+    shown: Callable[[Any], str] = repr
+    each: "Check | None" = None  # of the elements of a list
+
+    def __call__(self, name: str, value: Any) -> None:
+        """Check a value."""
+        if not self.hold(value):
+            raise InputError(f"{name} is {self.shown(value)}; it must be {self.text}")
+        if self.each is not None:
+            for i, element in enumerate(value):
+                self.each(f"{name}[{i}]", element)
 
 
-def _entry(text: str, check: Check = lambda name, value: None, **default: Any) -> Any:
+def _entry(text: str, check: Check = Check(lambda _: True, ""), **default: Any) -> Any:
     """An entry of a table: its meaning, a check of its value, and `default`, if it can be left out."""
     return field(**default, metadata={"text": text, "check": check})
 
 
-def _must(hold: Callable[[Any], bool], text: str, shown: Callable[[Any], str] = repr) -> Check:
-    def check(name: str, value: object) -> None:
-        if not hold(value):
-            raise InputError(f"{name} is {shown(value)}; {text}")
-
-    return check
-
-
 def _within(lowest: float, highest: float) -> Check:
-    return _must(lambda value: lowest <= value <= highest, f"it must be from {lowest:g} to {highest:g}", "{:g}".format)
+    return Check(lambda value: lowest <= value <= highest, f"from {lowest:g} to {highest:g}", "{:g}".format)
 
 
 def _one_of(*values: object) -> Check:
-    text = f"it must be one of {', '.join(map(str, values))}"
-    return _must(lambda value: type(value) is type(values[0]) and value in values, text)
+    return Check(lambda value: type(value) is type(values[0]) and value in values, f"one of {', '.join(map(str, values))}")
 
 
 def _list_of(counts: int | tuple[int, ...], check_element: Check) -> Check:
     allowed = counts if isinstance(counts, tuple) else (counts,)
-
-    def check(name: str, values: Any) -> None:
-        if not isinstance(values, tuple) or len(values) not in allowed:
-            raise InputError(f"{name} is {values!r}; it must be a list of {' or '.join(map(str, allowed))}")
-        for i, value in enumerate(values):
-            check_element(f"{name}[{i}]", value)
-
-    return check
+    return Check(
+        lambda values: isinstance(values, tuple) and len(values) in allowed,
+        f"a list of {' or '.join(map(str, allowed))}",
+        each=check_element,
+    )
 
 
 _TIME = _within(0.001, _LONGEST_TIME)
-_positive = _must(lambda value: isfinite(value) and value > 0.0, "it must be positive and finite", "{:g}".format)
-_node_id = _must(lambda value: type(value) is int and 1 <= value <= 127, "a node id is a number from 1 to 127")
+_POSITIVE = Check(lambda value: isfinite(value) and value > 0.0, "positive and finite", "{:g}".format)
+_NODE_ID = Check(lambda value: type(value) is int and 1 <= value <= 127, "a whole number from 1 to 127")
 
 
 def _confine_to_loopback(bus: can.BusABC, group: str) -> None:
@@ -137,7 +140,7 @@ class BusSettings:
 class ControllerSettings:
     """The controller's node."""
 
-    node: int = _entry("node id, for the heartbeat", _node_id)
+    node: int = _entry("node id, for the heartbeat", _NODE_ID)
     heartbeat: float = _entry("interval of the heartbeats [s]", _TIME)
     heartbeat_timeout: float = _entry("time without a heartbeat after which the drives stop by themselves [s]")
     answer_share: float = _entry("share of the period that an exchange waits for answers", _within(0.05, 0.95))
@@ -151,19 +154,19 @@ class ControllerSettings:
 class DriveSettings:
     """The six drives, by leg."""
 
-    nodes: tuple[int, ...] = _entry("node ids", _list_of(LEGS, _node_id))
+    nodes: tuple[int, ...] = _entry("node ids", _list_of(LEGS, _NODE_ID))
     signs: tuple[int, ...] = _entry("signs of the motors' velocities when the legs extend", _list_of(LEGS, _one_of(1, -1)))
     eds: str = _entry("electronic data sheet; a relative path begins at the folder of the settings file")
-    screw_lead: float = _entry("lead of the actuators' screws [m per turn]", _positive)
-    gear_ratio: float = _entry("turns of the motor per turn of the screw", _positive)
+    screw_lead: float = _entry("lead of the actuators' screws [m per turn]", _POSITIVE)
+    gear_ratio: float = _entry("turns of the motor per turn of the screw", _POSITIVE)
     counts_per_turn: int = _entry("of the motor; velocities are in counts per second", _within(1, _INT32))
-    velocity_limit: float = _entry("larger commands are cut to it [m/s]", _positive)
-    quick_stop_deceleration: float = _entry("[m/s^2]", _positive)
+    velocity_limit: float = _entry("larger commands are cut to it [m/s]", _POSITIVE)
+    quick_stop_deceleration: float = _entry("[m/s^2]", _POSITIVE)
     heartbeat: float = _entry("interval of the heartbeats [s]", _TIME)
     silence: float = _entry("time after which a silent drive counts as not ready [s]")
     command_timeout: float = _entry("time without SYNC and commands after which a drive stops by itself [s]", _TIME)
     mode: str = _entry("of operation: cyclic synchronous velocity or position", _one_of(*MODES), default=VELOCITY)
-    following_error: float = _entry("in position mode, beyond which a drive has a fault [m]", _positive, default=0.005)
+    following_error: float = _entry("in position mode, beyond which a drive has a fault [m]", _POSITIVE, default=0.005)
 
     def __post_init__(self) -> None:
         _within(2.0 * self.heartbeat, _LONGEST_TIME)("[drives] silence", self.silence)
@@ -193,12 +196,12 @@ class DriveSettings:
 class ImuSettings:
     """The seven IMUs: those on the legs, then the platform's; with --base-imu, that on the base comes last."""
 
-    nodes: tuple[int, ...] = _entry("node ids", _list_of((IMU_COUNT, SLOTS), _node_id))
+    nodes: tuple[int, ...] = _entry("node ids", _list_of((IMU_COUNT, SLOTS), _NODE_ID))
     signs: tuple[tuple[int, ...], ...] = _entry("signs of the axes", _list_of((IMU_COUNT, SLOTS), _list_of(3, _one_of(1, -1))))
     eds: str = _entry("electronic data sheet; a relative path begins at the folder of the settings file")
-    gyroscope_scale: float = _entry("value of one LSB of 16 bits [rad/s]", _positive)
-    accelerometer_scale: float = _entry("value of one LSB of 16 bits [m/s^2]", _positive)
-    magnetometer_scale: float = _entry("value of one LSB of 16 bits [uT]", _positive)
+    gyroscope_scale: float = _entry("value of one LSB of 16 bits [rad/s]", _POSITIVE)
+    accelerometer_scale: float = _entry("value of one LSB of 16 bits [m/s^2]", _POSITIVE)
+    magnetometer_scale: float = _entry("value of one LSB of 16 bits [uT]", _POSITIVE)
     heartbeat: float = _entry("interval of the heartbeats [s]", _TIME)
 
     def __post_init__(self) -> None:
@@ -265,6 +268,15 @@ class CanopenSettings:
         return load
 
 
+TABLES: dict[str, Any] = {
+    "bus": BusSettings,
+    "controller": ControllerSettings,
+    "drives": DriveSettings,
+    "imus": ImuSettings,
+}
+"""The tables of the file, and what they are read as."""
+
+
 def object_dictionary(eds: str, node: int) -> Any:
     """The object dictionary (canopen's) of a node.
 
@@ -315,12 +327,11 @@ def canopen_settings(
     """
     path = Path(path)
     document = read_toml(path)
-    kinds: dict[str, Any] = {"bus": BusSettings, "controller": ControllerSettings, "drives": DriveSettings, "imus": ImuSettings}
     for name in [*document, *changes]:
-        if name not in kinds:
-            raise InputError(f"{path} has a table [{name}] that is not known; the tables are {', '.join(kinds)}")
+        if name not in TABLES:
+            raise InputError(f"{path} has a table [{name}] that is not known; the tables are {', '.join(TABLES)}")
     made = []
-    for name, kind in kinds.items():
+    for name, kind in TABLES.items():
         values = _checked(name, kind, {**document.get(name, {}), **changes.get(name, {})})
         if "eds" in values:
             values["eds"] = str(path.resolve().parent / values["eds"])

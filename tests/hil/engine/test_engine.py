@@ -137,11 +137,11 @@ def test_workers_are_other_processes_and_their_page_is_named(two):
 
 def test_without_dask_all_is_done_here_unless_more_is_asked_for(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    for settings in (None, EngineSettings(), EngineSettings(workers=1)):
-        with open_engine(settings) as engine:
+    for chosen in (None, EngineSettings(), EngineSettings(workers=1)):
+        with open_engine(chosen) as engine:
             assert engine.map(late, [0.0]) == [(0.0, os.getpid())]
-    for settings in (TWO, NOBODY):
-        with pytest.raises(MissingPackageError, match=r"this needs distributed.*gough\[sweep\]"), open_engine(settings):
+    for chosen in (TWO, NOBODY):
+        with pytest.raises(MissingPackageError, match=r"this needs distributed.*gough\[sweep\]"), open_engine(chosen):
             pass
 
 

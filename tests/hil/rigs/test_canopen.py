@@ -556,7 +556,7 @@ def test_counters_that_wrap():
         ({"bus": {"fd": 1}}, "fd must be a bool"),
         ({"bus": {"bitrate": 2_000_000}}, "bitrate is 2e.06; it must be from 10000 to 1e.06"),
         ({"drives": {"nodes": [1, 2, 3, 4, 5]}}, r"nodes is .*; it must be a list of 6"),
-        ({"drives": {"nodes": [1, 2, 3, 4, 5, 128]}}, r"nodes\[5\] is 128; a node id is a number from 1 to 127"),
+        ({"drives": {"nodes": [1, 2, 3, 4, 5, 128]}}, r"nodes\[5\] is 128; it must be a whole number from 1 to 127"),
         ({"drives": {"nodes": [1, 2, 3, 4, 5, 11]}}, "IMU 0 and drive 5 have the same node id 11"),
         ({"drives": {"signs": [1, 1, 1, 1, 1, 2]}}, r"signs\[5\] is 2; it must be one of 1, -1"),
         ({"drives": {"screw_lead": 0.0}}, "screw_lead is 0; it must be positive"),
