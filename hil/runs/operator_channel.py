@@ -10,7 +10,7 @@ import asyncio
 import hmac
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -37,8 +37,8 @@ from plant.errors import GoughError, InputError
 TELEMETRY_HZ = 30.0
 
 _STEP_S = 0.003
-_TIMING_S = 1.0
-"""Of how many seconds the timing is told."""
+_TIMING_S, _TIMED_S = 1.0, 0.2
+"""Of how many seconds the timing is told, and how long a timing is told on: it reads as many records of the loop's memory."""
 
 _HELLO_S = 5.0
 """How long a client may take to say who it is."""
@@ -99,13 +99,10 @@ class _Client:
     period: float = np.inf  # of its telemetry [s]
     due: float = 0.0
 
-    def send(self, message: dict[str, Any]) -> None:
-        self.writer.write(encode(message))
-
-    @property
-    def slow(self) -> bool:
-        """Whether much waits for it."""
-        return self.writer.transport.get_write_buffer_size() > _MOST_WAITING
+    def send(self, line: bytes) -> None:
+        """Send it an encoded message, unless much waits for it."""
+        if self.writer.transport.get_write_buffer_size() <= _MOST_WAITING:
+            self.writer.write(line)
 
 
 class _Channel:
@@ -117,6 +114,8 @@ class _Channel:
         self._shared, self._platform, self._place, self._token = stream["shared"], platform, workplace, token
         self._records, self._link, self._seen = records, link, 0
         self._latest: Any = None
+        self._timed = 0
+        self._last_timing: Mapping[str, float] = {}
         self._clients: list[_Client] = []
         self._waiting = 0
         self._doing: dict[str, Callable[[_Client, dict[str, Any]], dict[str, Any]]] = {
@@ -156,7 +155,7 @@ class _Channel:
             return
         try:
             while line := await reader.readline():
-                client.send(self._answer(client, line))
+                writer.write(encode(self._answer(client, line)))
                 await writer.drain()
         except (OSError, ValueError):
             # It has gone, or its line has no end.
@@ -304,9 +303,10 @@ class _Channel:
     # ---------------------------------------------------------------------------------------------------------- telemetry
 
     def _tell(self, message: dict[str, Any]) -> None:
+        line = encode(message)
         for client in self._clients:
-            if client.period < np.inf and not client.slow:
-                client.send(message)
+            if client.period < np.inf:
+                client.send(line)
 
     def _look(self, now: float) -> None:
         """Take the loop's new records, and send what is due."""
@@ -320,11 +320,10 @@ class _Channel:
                     self._tell({"event": text, "cycle": int(eventful["cycle"])})
         due = [each for each in self._clients if each.period < np.inf and now >= each.due]
         if due:
-            message = {"telemetry": self._telemetry()}
+            line = encode({"telemetry": self._telemetry()})
             for client in due:
                 client.due = now + client.period if client.due < now - client.period else client.due + client.period
-                if not client.slow:
-                    client.send(message)
+                client.send(line)
 
     def _telemetry(self) -> dict[str, Any]:
         """What the run does now, in SI units."""
@@ -338,10 +337,15 @@ class _Channel:
         }
         if latest is None:
             return told
+        return told | state_message(latest, self._place.frames) | {"timing": self._timing()}
+
+    def _timing(self) -> Mapping[str, float]:
         size, done = len(self._records), self._seen
-        count = min(round(_TIMING_S / self._period), done, size // 2)
-        timing = timing_message(self._records, np.arange(done - count, done) % size, self._period)
-        return told | state_message(latest, self._place.frames) | {"timing": timing}
+        if done >= self._timed + _TIMED_S / self._period:
+            count = min(round(_TIMING_S / self._period), done, size // 2)
+            self._timed = done
+            self._last_timing = timing_message(self._records, np.arange(done - count, done) % size, self._period)
+        return self._last_timing
 
 
 def _name_in(request: dict[str, Any], name: str) -> str | None:
