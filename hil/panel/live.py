@@ -18,7 +18,7 @@ from typing import Any
 
 import viser
 
-from hil.panel.readings import Readings, set_text, status
+from hil.panel.readings import Readings, set_text
 from hil.panel.scene import Machine, Scene
 from hil.runs.operator import BEAT_S, Operator, RequestRefusedError
 from hil.runs.operator_messages import ChannelError
@@ -68,17 +68,19 @@ class LivePanel:
     def run(self, over: threading.Event) -> None:
         """Show the run until `over` is set; when it has ended, its last state stays."""
         self._watching.watch()
-        while not over.is_set():
+        running = True
+        while running and not over.is_set():
             try:
-                self._watching.listen(_LISTEN_S)
+                self._watching.listen(_LISTEN_S, newest=True)
             except ChannelError:
-                set_text(self._status, f"{self._status.content}\n\n**The run has ended.**")
-                print("the run has ended; Ctrl-C closes the panel", flush=True)
-                over.wait()
-                return
+                running = False
             self._take_events()
             if self._watching.telemetry:
-                self._show(self._watching.telemetry)
+                self._show(self._watching.telemetry, last=not running)
+        if not running:
+            set_text(self._status, f"{self._status.content}\n\n**The run has ended.**")
+            print("the run has ended; Ctrl-C closes the panel", flush=True)
+            over.wait()
 
     def close(self) -> None:
         """Leave the run."""
@@ -107,7 +109,7 @@ class LivePanel:
         with tabs.add_tab("Sliders"):
             self._build_sliders()
         with tabs.add_tab("Readings"):
-            self._readings = Readings(self._server, self.machine, self._scene, self._run["frames"])
+            self._readings = Readings(self._server, self.machine, self._scene, self._run["frames"], self._status)
 
     def _build_jog(self) -> None:
         gui = self._server.gui
@@ -193,10 +195,10 @@ class LivePanel:
             event = events.popleft()
             self._events.append(f"cycle {event['cycle']}: {event['event']}" if "cycle" in event else str(event["event"]))
 
-    def _show(self, state: dict[str, Any]) -> None:
-        self._scene.show(state)
-        set_text(self._status, status(state))
-        self._readings.show(state, self._events)
+    def _show(self, state: dict[str, Any], last: bool) -> None:
+        with self._server.atomic():
+            self._scene.show(state)
+            self._readings.show(state, self._events, at_once=last)
 
     def _show_operator(self, who: int | None) -> None:
         text = "nobody operates from this panel" if who is None else f"browser {who} operates the run"

@@ -12,7 +12,7 @@ import viser
 
 from controller.direct_kinematics import poses_from_lengths
 from controller.frames import ActiveFrames, Frames
-from hil.panel.readings import Readings, set_text, status
+from hil.panel.readings import Readings
 from hil.panel.scene import Machine, Scene
 from hil.recording.mcap import read_run
 from hil.runs.operator_messages import pose_message
@@ -104,11 +104,11 @@ class Playback:
         self._scene = Scene(server, machine)
         gui = server.gui
         gui.configure_theme(control_layout="collapsible", control_width="medium", show_logo=False, show_share_button=False)
-        self._status = gui.add_markdown("")
+        status = gui.add_markdown("")
         self._time: Any = gui.add_slider("Time [s]", 0.0, max(run.duration, run.period), run.period, 0.0)
         self._playing = gui.add_checkbox("Play", True)
         self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
-        self._readings = Readings(server, machine, self._scene, ActiveFrames(Frames()).described())
+        self._readings = Readings(server, machine, self._scene, ActiveFrames(Frames()).described(), status)
 
     def run(self, over: threading.Event) -> None:
         """Play, again and again, until `over` is set."""
@@ -123,6 +123,6 @@ class Playback:
 
     def _show(self, index: int) -> None:
         state = self._run.state(index)
-        self._scene.show(state)
-        set_text(self._status, status(state))
-        self._readings.show(state, self._run.told(index))
+        with self._server.atomic():
+            self._scene.show(state)
+            self._readings.show(state, self._run.told(index))

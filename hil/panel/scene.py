@@ -87,12 +87,12 @@ class Scene:
         add.set_up_direction(tuple(up))
         add.add_frame("/base/axes", axes_length=0.3 * radius, axes_radius=0.006 * radius)
         _plate(server, "/base/plate", machine.base_joints, _BASE, 0.5)
-        self._platform = add.add_frame("/platform", axes_length=0.25 * radius, axes_radius=0.006 * radius)
-        _plate(server, "/platform/plate", machine.platform_joints, _PLATFORM, 0.7)
-        self._ghosts = {
-            name: _outline(server, f"/{name}", machine.platform_joints, color, 0.008 * radius)
-            for name, color in (("commanded", _REFERENCE), ("truth", _TRUTH))
+        self._placed = {
+            "platform": add.add_frame("/platform", axes_length=0.25 * radius, axes_radius=0.006 * radius),
+            "commanded": _outline(server, "/commanded", machine.platform_joints, _REFERENCE, 0.008 * radius),
+            "truth": _outline(server, "/truth", machine.platform_joints, _TRUTH, 0.008 * radius),
         }
+        _plate(server, "/platform/plate", machine.platform_joints, _PLATFORM, 0.7)
         self._legs = add.add_line_segments(
             "/legs", np.zeros((machine.legs, 2, 3), np.float32), (90, 90, 90), thickness=_LEG_SHARE * radius
         )
@@ -115,20 +115,25 @@ class Scene:
         if look == self._shown:
             return
         self._shown = look
+        told = {"platform": known, "commanded": state.get("commanded"), "truth": state.get("truth")}
+        poses = {name: pose_in(pose) for name, pose in told.items() if pose}
         with self._server.atomic():
-            for name, ghost in self._ghosts.items():
-                ghost.visible = state.get(name) is not None
-                if state.get(name) is not None:
-                    _place(ghost, pose_in(state[name]))
+            for name in ("commanded", "truth"):
+                self._placed[name].visible = name in poses
+            self._place(poses)
             if known is None:
                 return
-            pose = pose_in(known)
-            _place(self._platform, pose)
+            pose = poses["platform"]
             ends = pose.position + machine.platform_joints @ pose.rotation.T
             self._legs.points = np.stack([machine.base_joints, ends], axis=1).astype(np.float32)
             if "lengths" in state:
                 colors = leg_colors(machine.shares(state, self.coloring))
                 self._legs.colors = np.repeat(colors[:, None], 2, axis=1)
+
+    def _place(self, poses: Mapping[str, Pose]) -> None:
+        quaternions = quaternion_from_rotation(np.reshape([pose.rotation for pose in poses.values()], (-1, 3, 3)))
+        for (name, pose), quaternion in zip(poses.items(), quaternions, strict=True):
+            self._placed[name].position, self._placed[name].wxyz = tuple(pose.position), tuple(quaternion)
 
 
 def _look(state: Mapping[str, Any], coloring: str) -> tuple[Any, ...]:
@@ -145,10 +150,6 @@ def leg_colors(shares: Array) -> NDArray[np.uint8]:
     warm, hot = np.clip(shares / 0.7, 0.0, 1.0), np.clip((shares - 0.7) / 0.3, 0.0, 1.0)
     colors: NDArray[np.uint8] = np.round(_GOOD + warm * (_WARM - _GOOD) + hot * (_BAD - _WARM)).astype(np.uint8)
     return colors
-
-
-def _place(handle: Any, pose: Pose) -> None:
-    handle.position, handle.wxyz = tuple(pose.position), tuple(quaternion_from_rotation(pose.rotation))
 
 
 def _rim(joints: Array) -> Array:

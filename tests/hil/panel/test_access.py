@@ -14,7 +14,7 @@ from controller.frames import ActiveFrames, Frames  # noqa: E402
 from hil.command_line import main  # noqa: E402
 from hil.loop.records import RECORD  # noqa: E402
 from hil.panel.access import Gate, close_server, open_server, panel_address  # noqa: E402
-from hil.panel.readings import error_line, leg_table, pose_table, status  # noqa: E402
+from hil.panel.readings import error_line, leg_table, pose_table, status_line  # noqa: E402
 from hil.panel.scene import Machine, leg_colors  # noqa: E402
 from hil.runs.telemetry import machine_message, state_message, timing_message  # noqa: E402
 from plant.errors import InputError  # noqa: E402
@@ -145,7 +145,7 @@ def test_a_record_becomes_a_state_and_words(hexapod, machine):
     assert "protection level 1.50 mm, inf deg" in error_line(state)
     rows = leg_table(state, machine).splitlines()
     assert rows[7].endswith("| **out** |") and rows[2].endswith("| used |")
-    assert status(state).startswith("**idle**")
+    assert status_line(state).startswith("**idle**")
     timing = timing_message(records, np.arange(3), 1e-3)
     assert timing["late"] == pytest.approx(2e-6) and timing["missed"] == 2
     assert timing_message(records, np.arange(0), 1e-3) == {}
