@@ -16,12 +16,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
 from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
 from hil.loop.records import COMPUTED, shared_array
@@ -43,6 +45,9 @@ the panel may take, and how often the picture must change at least, of 30 times 
 
 RATIOS = ("compute", "wake"), ("p50", "p999")
 
+FIELDS = ("cycle", "late_ns", "stage_ns", "cpu_ns", "missed")
+"""What is kept of a record, which has 2 kB."""
+
 _RATE = 1000.0
 _ROUND_S = 10.0
 _SETTLE_S = 1.0
@@ -59,7 +64,7 @@ class Slice:
     """A part of a run without or with the panel.
 
     Attributes:
-        records: (N,), dtype `RECORD`, of its cycles.
+        records: (N,), of its cycles, of dtype `RECORD` or with `FIELDS` of it.
         seconds: that it lasted.
         channel, panel: processor time that these processes took [s].
         frames, received: how often the picture changed, and bytes that the page received.
@@ -73,7 +78,7 @@ class Slice:
     frames: int
     received: int
 
-    @property
+    @cached_property
     def durations(self) -> dict[str, NDArray[np.int64]]:
         """Of computing and lateness, each (N,) [ns]."""
         return {"compute": self.records["stage_ns"][:, COMPUTED].sum(axis=1), "wake": self.records["late_ns"]}
@@ -114,12 +119,16 @@ def figures_of(slices: list[Slice]) -> dict[str, Any]:
     """The figures of slices, as `measure_panel` has them."""
     pools = {name: [each for each in slices if each.attached == (name == "with")] for name in ("without", "with")}
     figures: dict[str, Any] = {name: _figures(pool) for name, pool in pools.items()}
-    figures["ratios"] = _by_ratio(lambda what, which: _ratio(what, which, pools["with"], pools["without"]))
+    figures["ratios"] = _ratios(pools["with"], pools["without"])
     random = np.random.default_rng(0)
-    splits = [_split(pools["without"], random) for _ in range(_SPLITS)]
-    figures["noise"] = _by_ratio(
-        lambda what, which: float(np.exp(np.quantile([abs(np.log(_ratio(what, which, *split))) for split in splits], _SURE)))
-    )
+    splits = [_ratios(*_split(pools["without"], random)) for _ in range(_SPLITS)]
+    figures["noise"] = {
+        what: {
+            which: float(np.exp(np.quantile([abs(np.log(ratios[what][which])) for ratios in splits], _SURE)))
+            for which in RATIOS[1]
+        }
+        for what in RATIOS[0]
+    }
     return figures
 
 
@@ -140,15 +149,13 @@ def panel_excess(figures: dict[str, Any]) -> list[str]:
     return [f"with a panel: {text}" for text in found]
 
 
-def _by_ratio(value: Callable[[str, str], float]) -> dict[str, dict[str, float]]:
-    return {what: {which: value(what, which) for which in RATIOS[1]} for what in RATIOS[0]}
-
-
-def _ratio(what: str, which: str, slices: list[Slice], others: list[Slice]) -> float:
+def _ratios(slices: list[Slice], others: list[Slice]) -> dict[str, dict[str, float]]:
+    """The durations of slices over those of others, by `RATIOS`."""
     over, under = (
-        percentiles(np.concatenate([each.durations[what] for each in pool]), (which,))[which] for pool in (slices, others)
+        {what: percentiles(np.concatenate([each.durations[what] for each in pool]), RATIOS[1]) for what in RATIOS[0]}
+        for pool in (slices, others)
     )
-    return over / under
+    return {what: {which: over[what][which] / under[what][which] for which in RATIOS[1]} for what in RATIOS[0]}
 
 
 def _split(slices: list[Slice], random: np.random.Generator) -> tuple[list[Slice], list[Slice]]:
@@ -212,13 +219,17 @@ def _measure_round(seconds: float) -> tuple[list[Slice], list[str]]:
             with _attached_panel(address) as panel:
                 samples.append((True, *sampled(seconds, panel)))
             samples.append((False, *sampled(seconds / 2.0, None)))
-        records = read_run([recording])[1]
+        records = repack_fields(read_run([recording])[1][list(FIELDS)])
         refused: list[str] = json.loads(summary.read_text())["refused"]
-    cycles = records["cycle"]
     slices = []
     for attached, begin, end in samples:
-        took = [after - before for before, after in zip(begin[1:], end[1:], strict=True)]
-        slices.append(Slice(attached, records[(cycles >= begin.cycle) & (cycles < end.cycle)], *took))
+        within = (records["cycle"] >= begin.cycle) & (records["cycle"] < end.cycle)
+        slices.append(
+            Slice(
+                attached, records[within], end.time - begin.time, end.channel - begin.channel, end.panel - begin.panel,
+                end.frames - begin.frames, end.received - begin.received,
+            )
+        )  # fmt: skip
     return slices, refused
 
 
