@@ -8,49 +8,58 @@ from hil.command_line.terminal import QUANTILES, progress_bar
 from hil.table import Table
 from plant.errors import InputError
 
+_SECTIONS = ("clock", "panel", "loop", "plant", "kinematics", "workspace")
+
 
 @cli.command(
     cli.setting("--duration", 60.0, "duration of the simulated motion [s]"),
     cli.setting("--target", "sines", "motion or CSV file"),
-    cli.argument("--only", choices=("loop", "plant", "kinematics", "workspace", "clock"), help="one section instead of all"),
+    cli.argument(
+        "--only", choices=_SECTIONS, nargs="+", default=_SECTIONS, metavar="SECTION",
+        help=f"some sections instead of all: {', '.join(_SECTIONS)}",
+    ),
     cli.setting(
         "--clock", 10.0, "time on the clock at 1 kHz, idle and again under load; 4 kHz gets a third [s]", metavar="SECONDS"
     ),
     cli.argument(
         "--measures", type=float, metavar="SECONDS", help="also try the loop without each measure for real time, for this time"
     ),
+    cli.setting("--panel", 60.0, "time on the clock without a panel, and as long with one [s]", metavar="SECONDS"),
     cli.flag("--cold", "measure the start without caches, too (a minute)"),
-    cli.flag("--check", "fail if the loop on the clock is off by more than any noise"),
-    cli.report("write histograms of the loop on the clock"),
+    cli.flag("--check", "fail if the loop on the clock is off by more than any noise, or a panel costs more than its limits"),
+    cli.report("write histograms of the loop on the clock, and without and with a panel"),
     cli.source("--history", "FILE.json", "earlier figures for the report", nargs="+", default=[]),
     cli.JSON,
-)
+)  # fmt: skip
 def gough_bench(options: Namespace) -> None:
     """Measure the loop, the plant and the kinematics: their speed and lateness.
 
     The loop on the clock: how late it wakes, beside cyclictest, and how long it computes, idle, under load and with a busy
-    supervisor; its speed against real time and the microseconds of each stage; the plant's FMU, from compiled code and through
-    FMPy, and how exact it is; direct kinematics: microseconds per pose, against Newton's method from lengths, here and in C,
-    and whether both find the pose from cold; and the margins of a pose in the workspace, against inverse kinematics.
+    supervisor; the same without and with a panel, and what that takes of a processor; the loop's speed against real time and
+    the microseconds of each stage; the plant's FMU, from compiled code and through FMPy, and how exact it is; direct
+    kinematics: microseconds per pose, against Newton's method from lengths, here and in C, and whether both find the pose from
+    cold; and the margins of a pose in the workspace, against inverse kinematics.
     """
     from hil.benchmarks.loop import machine, read_earlier
 
-    for name, seconds in (("--clock", options.clock), ("--measures", options.measures)):
+    for name, seconds in (("--clock", options.clock), ("--panel", options.panel), ("--measures", options.measures)):
         if seconds is not None and not 0.0 < seconds < float("inf"):
             raise InputError(f"{name} is {seconds:g} s; it must be positive and finite")
     earlier = [read_earlier(path) for path in options.history]
     figures: dict[str, Any] = machine()
-    sections = {"clock": _clock, "loop": _loop, "plant": _plant, "kinematics": _kinematics, "workspace": _workspace}
-    for section, measure in sections.items():
-        if options.only in (None, section):
+    measures = (_clock, _panel, _loop, _plant, _kinematics, _workspace)
+    for section, measure in zip(_SECTIONS, measures, strict=True):
+        if section in options.only:
             measure(options, figures)
     cli.write_json(options.json, figures)
     cli.write_report(options, "benchmark", figures, earlier)
     print(f"{figures['machine']}, {figures['date']}, gough {figures['version']}")
     if options.check:
         from hil.benchmarks.clock import GrossExcessError, gross_excess
+        from hil.benchmarks.panel import panel_excess
 
-        if excess := gross_excess(figures.get("real_time", {"rates": {}})):
+        excess = gross_excess(figures["real_time"]) if "real_time" in figures else []
+        if excess := excess + (panel_excess(figures["panel"]) if "panel" in figures else []):
             raise GrossExcessError(f"in gross excess: {'; '.join(excess)}")
 
 
@@ -115,6 +124,32 @@ def _print_condition(title: str, measured: dict[str, Any]) -> None:
 def _ratios(durations: dict[str, float], others: dict[str, float]) -> str:
     p50, p999 = (durations[key] / others[key] for key in ("p50", "p999"))
     return f"p50 {p50:.2f}, p99.9 {p999:.2f}"
+
+
+def _panel(options: Namespace, figures: dict[str, Any]) -> None:
+    from hil.benchmarks.panel import LIMITS, measure_panel
+
+    with progress_bar("the panel") as progress:
+        measured = figures["panel"] = measure_panel(options.panel, progress)
+    without, attached = measured["without"], measured["with"]
+    table = Table("1 kHz", "without a panel", "with one", "ratio", "noise", "limit")
+    for label, name in (("computing", "compute"), ("woken late", "wake")):
+        for which, key in (("p50", "p50"), ("p99.9", "p999")):
+            cells = [f"{each[f'{name}_us'][key]:.2f}" for each in (without, attached)]
+            ratio, noise = (measured[kind][name][key] for kind in ("ratios", "noise"))
+            table.add(f"{label} {which} [us]", *cells, f"{ratio:.3f}", f"{noise:.3f}", f"{LIMITS[key]:.2f}")
+    table.add("missed by own work", f"{without['missed_own']}", f"{attached['missed_own']}", "", "", f"{LIMITS['missed_own']}")
+    table.add("missed by the host", f"{without['missed_host']}", f"{attached['missed_host']}", "", "", "")
+    table.add("panel [processors]", "", f"{attached['panel_cores']:.3f}", "", "", f"{LIMITS['panel_cores']:.2f}")
+    table.add("channel [processors]", f"{without['channel_cores']:.3f}", f"{attached['channel_cores']:.3f}", "", "", "")
+    table.add("new pictures [Hz]", "", f"{attached['frames_hz']:.1f}", "", "", f">= {LIMITS['frames_hz']:g}")
+    table.print()
+    print(
+        f"{measured['rounds']} runs, {measured['seconds']:g} s without and with; the page receives "
+        f"{attached['bytes_per_s'] / 1e3:.0f} kB/s; noise: halves of the time without are within this factor of each other"
+    )
+    for text in measured["refused"]:
+        print(f"without {text}")
 
 
 def _loop(options: Namespace, figures: dict[str, Any]) -> None:

@@ -20,7 +20,7 @@ import viser
 
 from controller.frames import BASE, PLATFORM
 from hil.panel.margins import MARGINS_S, MarginTable
-from hil.panel.readings import Readings, event_list, set_text, status
+from hil.panel.readings import Readings, event_list, set_text
 from hil.panel.scene import Machine, Scene
 from hil.runs.operator import BEAT_S, Operator, RequestRefusedError
 from hil.runs.operator_messages import RUN_ENDED, ChannelError
@@ -74,17 +74,17 @@ class LivePanel:
     def run(self, over: threading.Event) -> str:
         """Show the run until it ends or `over` is set; the picture of its last state stays. Returns how it ended, in words."""
         self._watching.watch()
-        while not over.is_set():
+        running = True
+        while running and not over.is_set():
             try:
-                self._watching.listen(_LISTEN_S)
+                self._watching.listen(_LISTEN_S, newest=True)
                 self._look_at_margins()
             except ChannelError:
                 print("the run has ended; Ctrl-C closes the panel", flush=True)
-                break
+                running = False
             self._take_events()
             if self._watching.telemetry:
-                self._show(self._watching.telemetry)
-        self._take_events()
+                self._show(self._watching.telemetry, last=not running)
         events = event_list([event for event in self._events if event != RUN_ENDED])
         return f"{self._status.content}\n\n**The run has ended.**\n\n{events}\n\n"
 
@@ -117,7 +117,7 @@ class LivePanel:
                 with tabs.add_tab(label):
                     build()
         with tabs.add_tab("Readings"):
-            self._readings = Readings(self._server, self.machine, self._scene, self._run["frames"])
+            self._readings = Readings(self._server, self.machine, self._scene, self._run["frames"], self._status)
         with tabs.add_tab("Limits"):
             self._margins = MarginTable(self._server)
 
@@ -217,10 +217,10 @@ class LivePanel:
             event = events.popleft()
             self._events.append(f"cycle {event['cycle']}: {event['event']}" if "cycle" in event else str(event["event"]))
 
-    def _show(self, state: dict[str, Any]) -> None:
-        self._scene.show(state)
-        set_text(self._status, status(state))
-        self._readings.show(state, self._events)
+    def _show(self, state: dict[str, Any], last: bool) -> None:
+        with self._server.atomic():
+            self._scene.show(state)
+            self._readings.show(state, self._events, at_once=last)
 
     def _show_operator(self, who: int | None) -> None:
         text = "nobody operates from this panel" if who is None else f"browser {who} operates the run"

@@ -7,7 +7,7 @@ from typing import Any
 import viser
 
 from hil.panel.margins import MARGINS_S, MarginTable
-from hil.panel.readings import Readings, set_text, status
+from hil.panel.readings import Readings
 from hil.panel.scene import Machine, Scene
 from hil.runs.recorded_run import RecordedRun
 from hil.runs.telemetry import frames_message, machine_message
@@ -25,11 +25,11 @@ class Playback:
         self._scene = Scene(server, machine)
         gui = server.gui
         gui.configure_theme(control_layout="collapsible", control_width="medium", show_logo=False, show_share_button=False)
-        self._status = gui.add_markdown("")
+        status = gui.add_markdown("")
         self._time: Any = gui.add_slider("Time [s]", 0.0, max(run.duration, run.period), run.period, 0.0)
         self._playing = gui.add_checkbox("Play", True)
         self._speed = gui.add_dropdown("Speed", _SPEEDS, initial_value="1")
-        self._readings = Readings(server, machine, self._scene, frames_message(run.frames))
+        self._readings = Readings(server, machine, self._scene, frames_message(run.frames), status)
         with gui.add_folder("Limits"):
             self._margins, self._measured = MarginTable(server), 0.0
 
@@ -46,9 +46,9 @@ class Playback:
 
     def _show(self, index: int) -> None:
         state = self._run.state(index)
-        self._scene.show(state)
-        set_text(self._status, status(state))
-        self._readings.show(state, self._run.told(index))
+        with self._server.atomic():
+            self._scene.show(state)
+            self._readings.show(state, self._run.told(index))
         if time.monotonic() - self._measured > MARGINS_S:
             self._margins.show(self._run.margins(index))
             self._measured = time.monotonic()

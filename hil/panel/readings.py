@@ -1,5 +1,6 @@
 """What the panel says in numbers: tables in Markdown, of states as `hil.runs.telemetry` has them."""
 
+import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -9,27 +10,39 @@ import viser
 from controller.frames import BASE, PLATFORM, ActiveFrames, parse_frames
 from hil.look import COLORINGS, ESTIMATE, LENGTH, REFERENCE, ROOM, SPEED, TRUTH
 from hil.panel.scene import Machine, Scene
-from hil.runs.operator_messages import pose_in
+from hil.runs.operator_messages import pose_in, pose_message
 from plant.imu_wiring import PLATFORM_IMU
-from plant.pose import Pose, vector_from_rotation
+from plant.pose import rotation_angle
+
+_TEXT_S = 0.2
+"""Time between changes of the texts: nobody reads faster, and each costs as much as a picture."""
 
 
 class Readings:
-    """The part of a page with readings, and the choice of what the colours of the legs show."""
+    """The part of a page with readings, and the choice of what the colours of the legs show; `status` is where the page says
+    what the run does.
+    """
 
-    def __init__(self, server: viser.ViserServer, machine: Machine, scene: Scene, frames: Mapping[str, Any]) -> None:
-        self._machine, self._choices = machine, frames_to_choose(frames)
+    def __init__(
+        self, server: viser.ViserServer, machine: Machine, scene: Scene, frames: Mapping[str, Any], status: Any
+    ) -> None:
+        self._machine, self._choices, self._due = machine, frames_to_choose(frames), 0.0
         gui = server.gui
         coloring = gui.add_dropdown("Colours of the legs", COLORINGS)
         coloring.on_update(lambda _: setattr(scene, "coloring", coloring.value))
         self._chosen = gui.add_dropdown("Poses of", tuple(self._choices))
-        self._texts = {name: gui.add_markdown("") for name in ("poses", "sure", "legs", "timing")}
+        self._texts = {"status": status, **{name: gui.add_markdown("") for name in ("poses", "sure", "legs", "timing")}}
         with gui.add_folder("Events"):
             self._texts["events"] = gui.add_markdown("none")
 
-    def show(self, state: Mapping[str, Any], events: Sequence[str]) -> None:
-        """Show a state, and the last events."""
+    def show(self, state: Mapping[str, Any], events: Sequence[str], at_once: bool = False) -> None:
+        """Show a state, and the last events: a few times a second, or `at_once`."""
+        now = time.monotonic()
+        if now < self._due and not at_once:
+            return
+        self._due = now + _TEXT_S
         texts = {
+            "status": status_line(state),
             "poses": pose_table(state, self._choices.get(self._chosen.value)),
             "sure": error_line(state),
             "legs": leg_table(state, self._machine),
@@ -46,7 +59,7 @@ def set_text(handle: Any, text: str) -> None:
         handle.content = text
 
 
-def status(state: Mapping[str, Any]) -> str:
+def status_line(state: Mapping[str, Any]) -> str:
     """What the run does, in a line."""
     mode = f"**{state.get('mode', 'preparing')}**"
     doing = "jogging" if state.get("jogging") else "moving" if state.get("moving") else ""
@@ -69,12 +82,11 @@ def frames_to_choose(frames: Mapping[str, Any]) -> dict[str, ActiveFrames | None
 def pose_table(state: Mapping[str, Any], seen: ActiveFrames | None = None) -> str:
     """Estimate, reference and truth of a tool in a work frame; None for {2} in {1}."""
     named = [(ESTIMATE, state.get("pose")), (REFERENCE, state.get("commanded")), (TRUTH, state.get("truth"))]
-    rows = [(name, pose_in(pose)) for name, pose in named if pose]
+    rows = [(name, pose if seen is None else pose_message(seen.read(pose_in(pose)))) for name, pose in named if pose]
     if not rows:
         return "no pose"
     text = "| | x | y | z [mm] | rx | ry | rz [deg] |\n|---|--:|--:|--:|--:|--:|--:|\n"
-    cells = [(name, _pose_cells(pose if seen is None else seen.read(pose))) for name, pose in rows]
-    return text + "".join(f"| {name} | {' | '.join(numbers)} |\n" for name, numbers in cells)
+    return text + "".join(f"| {name} | {' | '.join(_pose_cells(pose))} |\n" for name, pose in rows)
 
 
 def error_line(state: Mapping[str, Any]) -> str:
@@ -84,8 +96,7 @@ def error_line(state: Mapping[str, Any]) -> str:
         parts.append(f"protection level {_level(state['protection'])}")
     if state.get("truth") and state.get("pose"):
         estimate, truth = pose_in(state["pose"]), pose_in(state["truth"])
-        off = np.linalg.norm(estimate.position - truth.position)
-        turned = np.linalg.norm(vector_from_rotation(estimate.rotation @ truth.rotation.T))
+        off, turned = np.linalg.norm(estimate.position - truth.position), rotation_angle(estimate.rotation, truth.rotation)
         parts.append(f"error {1e3 * off:.2f} mm, {np.degrees(turned):.3f} deg")
     return " · ".join(parts)
 
@@ -124,11 +135,10 @@ def event_list(events: Sequence[str]) -> str:
     return "\n".join(f"- {text}" for text in reversed(events)) or "none"
 
 
-def _pose_cells(pose: Pose) -> list[str]:
-    turn = np.degrees(vector_from_rotation(pose.rotation))
-    return [f"{value + 0.0:.2f}" for value in np.round(1e3 * pose.position, 2)] + [
-        f"{value + 0.0:.3f}" for value in np.round(turn, 3)
-    ]
+def _pose_cells(pose: Mapping[str, Any]) -> list[str]:
+    place, turn = np.round(1e3 * np.array(pose["position"]), 2), np.round(np.degrees(pose["rotation"]), 3)
+    # Without a minus before a zero.
+    return [f"{value + 0.0:.2f}" for value in place] + [f"{value + 0.0:.3f}" for value in turn]
 
 
 def _level(protection: Sequence[float | None]) -> str:

@@ -92,12 +92,12 @@ class Scene:
         add.set_up_direction(tuple(up))
         add.add_frame("/base/axes", axes_length=0.3 * radius, axes_radius=0.006 * radius)
         _plate(server, "/base/plate", machine.base_joints, BASE_COLOR, 0.5)
-        self._platform = add.add_frame("/platform", axes_length=0.25 * radius, axes_radius=0.006 * radius)
-        _plate(server, "/platform/plate", machine.platform_joints, PLATFORM_COLOR, 0.7)
-        self._ghosts = {
-            name: _outline(server, f"/{name}", machine.platform_joints, color, 0.008 * radius)
-            for name, color in (("commanded", REFERENCE_COLOR), ("truth", TRUTH_COLOR))
+        self._placed = {
+            "platform": add.add_frame("/platform", axes_length=0.25 * radius, axes_radius=0.006 * radius),
+            "commanded": _outline(server, "/commanded", machine.platform_joints, REFERENCE_COLOR, 0.008 * radius),
+            "truth": _outline(server, "/truth", machine.platform_joints, TRUTH_COLOR, 0.008 * radius),
         }
+        _plate(server, "/platform/plate", machine.platform_joints, PLATFORM_COLOR, 0.7)
         self._legs = add.add_line_segments(
             "/legs", np.zeros((machine.legs, 2, 3), np.float32), rgb(NEUTRAL), thickness=_LEG_SHARE * radius
         )
@@ -120,20 +120,25 @@ class Scene:
         if look == self._shown:
             return
         self._shown = look
+        told = {"platform": known, "commanded": state.get("commanded"), "truth": state.get("truth")}
+        poses = {name: pose_in(pose) for name, pose in told.items() if pose}
         with self._server.atomic():
-            for name, ghost in self._ghosts.items():
-                ghost.visible = state.get(name) is not None
-                if state.get(name) is not None:
-                    _place(ghost, pose_in(state[name]))
+            for name in ("commanded", "truth"):
+                self._placed[name].visible = name in poses
+            self._place(poses)
             if known is None:
                 return
-            pose = pose_in(known)
-            _place(self._platform, pose)
+            pose = poses["platform"]
             ends = pose.position + machine.platform_joints @ pose.rotation.T
             self._legs.points = np.stack([machine.base_joints, ends], axis=1).astype(np.float32)
             if "lengths" in state:
                 colors = leg_colors(machine.shares(state, self.coloring))
                 self._legs.colors = np.repeat(colors[:, None], 2, axis=1)
+
+    def _place(self, poses: Mapping[str, Pose]) -> None:
+        quaternions = quaternion_from_rotation(np.reshape([pose.rotation for pose in poses.values()], (-1, 3, 3)))
+        for (name, pose), quaternion in zip(poses.items(), quaternions, strict=True):
+            self._placed[name].position, self._placed[name].wxyz = tuple(pose.position), tuple(quaternion)
 
 
 def _look(state: Mapping[str, Any], coloring: str) -> tuple[Any, ...]:
@@ -142,10 +147,6 @@ def _look(state: Mapping[str, Any], coloring: str) -> tuple[Any, ...]:
     numbers = [value for pose in poses if pose for value in (*pose["position"], *pose["rotation"])]
     numbers += [0.01 * (value or 0.0) for value in state.get("rates", ())]
     return coloring, [pose is None for pose in poses], state.get("imus"), np.round(numbers, 5).tolist()
-
-
-def _place(handle: Any, pose: Pose) -> None:
-    handle.position, handle.wxyz = tuple(pose.position), tuple(quaternion_from_rotation(pose.rotation))
 
 
 def _plate(server: viser.ViserServer, name: str, joints: Array, color: str, opacity: float) -> None:

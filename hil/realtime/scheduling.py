@@ -157,5 +157,16 @@ def usage() -> Usage:
 
 def since_process_start() -> float:
     """Time since the start of this process [s], to a hundredth."""
-    started = int(Path("/proc/self/stat").read_text().rpartition(")")[2].split()[19]) / os.sysconf("SC_CLK_TCK")
+    started = int(_status("self")[19]) / os.sysconf("SC_CLK_TCK")
     return float(Path("/proc/uptime").read_text().split()[0]) - started
+
+
+def processor_time(process: int) -> float:
+    """Processor time that a process has taken so far [s], to a hundredth."""
+    user, system = _status(process)[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+def _status(process: int | str) -> list[str]:
+    """The fields of `/proc/PROCESS/stat` after the name, which may have blanks in it."""
+    return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()

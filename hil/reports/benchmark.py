@@ -16,25 +16,26 @@ def write_report(figures: dict[str, Any], history: Sequence[dict[str, Any]], pat
     The figures, and those in `history`, are as `gough bench --json` writes them.
 
     Raises:
-        InputError: the figures lack the section `real_time`, or the file cannot be written.
+        InputError: the figures lack the sections `real_time` and `panel`, or the file cannot be written.
     """
-    if "real_time" not in figures:
+    if not {"real_time", "panel"} & set(figures):
         raise InputError(
-            "a report shows the loop on the clock, which was not measured: run it with --only clock, or without --only"
+            "a report shows the loop on the clock, which was not measured: run it with --only clock panel, or without --only"
         )
     runs = sorted([*history, figures], key=lambda run: str(run["date"]))
+    rates = figures.get("real_time", {"rates": {}})["rates"]
     sections = []
-    for rate, conditions in figures["real_time"]["rates"].items():
+    for rate, conditions in rates.items():
         for condition, measured in conditions.items():
-            name = f"{rate} Hz, {condition.replace('_', ' ')}"
-            figure = go.Figure()
-            for label, (lower, counts) in measured["histograms"].items():
-                if counts:
-                    figure.add_scatter(x=lower, y=counts, name=label, mode="lines", line={"shape": "hv"})
-            axes = {"xaxis": {"title": "us", "type": "log"}, "yaxis": {"title": "cycles", "type": "log"}}
-            figure.update_layout(LAYOUT, height=380, **axes)
+            name, figure = f"{rate} Hz, {condition.replace('_', ' ')}", _histograms(measured["histograms"])
             sections.append(figure_html(f"clock-{rate}-{condition}", name, _sentence(measured), figure))
-    for rate in figures["real_time"]["rates"]:
+    if "panel" in figures:
+        panel = figures["panel"]
+        for what, name in (("compute", "computing"), ("wake", "woken late")):
+            figure = _histograms({f"{each} a panel": panel[each]["histograms"][what] for each in ("without", "with")})
+            title = f"{panel['rate']:g} Hz, without and with a panel: {name}"
+            sections.append(figure_html(f"panel-{what}", title, _panel_sentence(panel, what), figure))
+    for rate in rates:
         figure = go.Figure()
         for name in ("compute_us", "latency_us", "wake_us", "cyclictest_us"):
             for key in ("p50", "p999"):
@@ -46,6 +47,25 @@ def write_report(figures: dict[str, Any], history: Sequence[dict[str, Any]], pat
         sections.append(figure_html(f"history-{rate}", f"{rate} Hz, from run to run", caption, figure))
     subtitle = f"{figures['machine']}, {figures['date']}, gough {figures['version']}"
     write_page(path, "The loop on the clock", subtitle, "\n".join(sections))
+
+
+def _histograms(histograms: dict[str, Any]) -> go.Figure:
+    """Histograms by name, each lower ends of bins [us] and counts."""
+    figure = go.Figure()
+    for label, (lower, counts) in histograms.items():
+        if counts:
+            figure.add_scatter(x=lower, y=counts, name=label, mode="lines", line={"shape": "hv"})
+    axes = {"xaxis": {"title": "us", "type": "log"}, "yaxis": {"title": "cycles", "type": "log"}}
+    return figure.update_layout(LAYOUT, height=380, **axes)
+
+
+def _panel_sentence(panel: dict[str, Any], what: str) -> str:
+    ratios, noise, attached = panel["ratios"][what], panel["noise"][what], panel["with"]
+    return (
+        f"With a panel over without: p50 {ratios['p50']:.3f} (noise {noise['p50']:.3f}), p99.9 {ratios['p999']:.3f} "
+        f"({noise['p999']:.3f}); missed by own work {attached['missed_own']}, by the host {attached['missed_host']}. The panel "
+        f"takes {attached['panel_cores']:.3f} of a processor, for {attached['frames_hz']:.1f} pictures a second."
+    )
 
 
 def _sentence(measured: dict[str, Any]) -> str:

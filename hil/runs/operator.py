@@ -185,18 +185,17 @@ class Operator:
         """Ask for telemetry at a rate [Hz], by default 30, and for events; `listen` takes them in."""
         self.ask("watch", rate=rate)
 
-    def listen(self, seconds: float) -> None:
-        """Take in telemetry and events for a time.
+    def listen(self, seconds: float, newest: bool = False) -> None:
+        """Take in telemetry and events for a time, with `newest` only until telemetry has come and none that is newer waits.
 
         Raises:
             ChannelError: the run has gone.
         """
         until = time.monotonic() + seconds
-        while time.monotonic() < until:
-            line = self._line(until, lenient=True)
-            if not line:
-                return
+        while line := self._line(until, lenient=True):
             self._keep(line)
+            if newest and "telemetry" in line:
+                until = 0.0
 
     def margins(self) -> list[dict[str, Any]]:
         """How the platform stands to everything that limits it (`hil.runs.telemetry.margins_message`); [] without a pose."""
@@ -239,9 +238,9 @@ class Operator:
     def _line(self, until: float, lenient: bool = False) -> dict[str, Any]:
         """The next message; {} if none comes in time and that is no error."""
         while b"\n" not in self._rest:
-            left = until - time.monotonic()
+            left = max(until - time.monotonic(), 0.0)
             try:
-                ready = left > 0.0 and bool(select.select([self._socket], [], [], left)[0])
+                ready = bool(select.select([self._socket], [], [], left)[0])
                 received = self._socket.recv(MOST_LINE) if ready else None
             except OSError:
                 received = b""

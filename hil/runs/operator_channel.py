@@ -13,7 +13,7 @@ import hmac
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -53,8 +53,8 @@ _STEP_S, _LOOK_S, _IDLE_S = 0.003, 0.01, 0.2
 _MARGINS_S = 0.1
 """Margins are not found anew for so long, however often they are asked for."""
 
-_TIMING_S = 1.0
-"""Of how many seconds the timing is told."""
+_TIMING_S, _TIMED_S = 1.0, 0.2
+"""Of how many seconds the timing is told, and how long a timing is told on: it reads as many records of the loop's memory."""
 
 _HELLO_S = 5.0
 """How long a client may take to say who it is."""
@@ -106,13 +106,10 @@ class _Client:
     period: float = np.inf  # of its telemetry [s]
     due: float = 0.0
 
-    def send(self, message: dict[str, Any]) -> None:
-        self.writer.write(encode(message))
-
-    @property
-    def slow(self) -> bool:
-        """Whether much waits for it."""
-        return self.writer.transport.get_write_buffer_size() > _MOST_WAITING
+    def send(self, line: bytes) -> None:
+        """Send it an encoded message, unless much waits for it."""
+        if self.writer.transport.get_write_buffer_size() <= _MOST_WAITING:
+            self.writer.write(line)
 
 
 class _Channel:
@@ -123,6 +120,8 @@ class _Channel:
         self._platform, self._place, self._target, self._token, self._period = platform, workplace, target, token, period
         self._records, self._link, self._seen = records, link, 0
         self._latest: Any = None
+        self._timed = 0
+        self._last_timing: Mapping[str, float] = {}
         self._clients: list[_Client] = []
         self._waiting = 0
         self._measured, self._told_margins = -np.inf, list[dict[str, Any]]()
@@ -165,7 +164,7 @@ class _Channel:
             return
         try:
             while line := await reader.readline():
-                client.send(self._answer(client, line))
+                writer.write(encode(self._answer(client, line)))
                 await writer.drain()
         except (OSError, ValueError):
             # It has gone, or its line has no end.
@@ -344,9 +343,10 @@ class _Channel:
     # ---------------------------------------------------------------------------------------------------------- telemetry
 
     def _tell(self, message: dict[str, Any]) -> None:
+        line = encode(message)
         for client in self._clients:
-            if client.period < np.inf and not client.slow:
-                client.send(message)
+            if client.period < np.inf:
+                client.send(line)
 
     def _look(self, now: float) -> None:
         """Take the loop's new records, and send what is due."""
@@ -357,11 +357,10 @@ class _Channel:
         self._take()
         due = [each for each in self._clients if each.period < np.inf and now >= each.due]
         if due:
-            message = {"telemetry": self._telemetry()}
+            line = encode({"telemetry": self._telemetry()})
             for client in due:
                 client.due = now + client.period if client.due < now - client.period else client.due + client.period
-                if not client.slow:
-                    client.send(message)
+                client.send(line)
 
     def _take(self) -> None:
         records, self._seen, _ = take(self._records, self._link, self._seen)
@@ -378,10 +377,7 @@ class _Channel:
         """What the run does now, in SI units."""
         latest, told = self._latest, dict(_RESTING)
         if latest is not None:
-            size, done = len(self._records), self._seen
-            count = min(round(_TIMING_S / self._period), done, size // 2)
-            timing = timing_message(self._records, np.arange(done - count, done) % size, self._period)
-            told |= state_message(latest, self._place.frames) | {"timing": timing}
+            told |= state_message(latest, self._place.frames) | {"timing": self._timing()}
         if (platform := self._platform) is not None:
             now = {"time": platform.now, "commanded": pose_message(platform.commanded)}
             return told | now | {name: getattr(platform, name) for name in ("moving", "jogging", "paused")}
@@ -390,6 +386,14 @@ class _Channel:
         told |= {"time": int(latest["cycle"]) * self._period, "moving": bool(latest["reference"][:, 1].any())}
         reference = reference_pose(latest, self._place.mechanism)
         return told if reference is None else told | {"commanded": pose_message(reference)}
+
+    def _timing(self) -> Mapping[str, float]:
+        size, done = len(self._records), self._seen
+        if done >= self._timed + _TIMED_S / self._period:
+            count = min(round(_TIMING_S / self._period), done, size // 2)
+            self._timed = done
+            self._last_timing = timing_message(self._records, np.arange(done - count, done) % size, self._period)
+        return self._last_timing
 
 
 def _name_in(request: dict[str, Any], name: str) -> str | None:

@@ -89,6 +89,6 @@ def test_a_report_shows_histograms_and_earlier_figures(figures, tmp_path):
 
 
 def test_a_bench_of_no_time_is_refused(capsys):
-    for option, value in (("--clock", "0"), ("--measures", "-1"), ("--measures", "nan")):
+    for option, value in (("--clock", "0"), ("--panel", "0"), ("--measures", "-1"), ("--measures", "nan")):
         assert main(["bench", "--only", "clock", option, value]) == 2
         assert f"{option} is {value} s; it must be positive and finite" in capsys.readouterr().err

@@ -8,7 +8,15 @@ import time
 import pytest
 
 from hil.realtime import processes
-from hil.realtime.scheduling import MEASURES, RealTimeSettings, Usage, keep_to_one_thread, real_time, since_process_start
+from hil.realtime.scheduling import (
+    MEASURES,
+    RealTimeSettings,
+    Usage,
+    keep_to_one_thread,
+    processor_time,
+    real_time,
+    since_process_start,
+)
 from plant.errors import InputError
 
 
@@ -56,6 +64,13 @@ def test_the_time_since_the_start_of_the_process_goes_on():
     first = since_process_start()
     time.sleep(0.05)
     assert 0.0 < first < since_process_start() < first + 60.0
+
+
+def test_the_processor_time_of_a_process_is_what_it_has_computed():
+    begun, own = processor_time(os.getpid()), time.process_time()
+    while time.process_time() < own + 0.1:
+        pass
+    assert 0.08 < processor_time(os.getpid()) - begun < 0.2
 
 
 def test_openblas_keeps_to_one_thread_unless_told_otherwise(monkeypatch):

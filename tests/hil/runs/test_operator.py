@@ -419,6 +419,16 @@ def test_a_client_that_leaves_a_move_does_not_stop_it(hexapod):
         assert there["position"][0] == pytest.approx(0.01) and run.cause[0] == Cause.NONE
 
 
+def listen_to_the_newest(observer):
+    """What has come meanwhile is taken in at once; then the next one is waited for."""
+    observer.watch(2.0)
+    time.sleep(1.6)
+    began = time.monotonic()
+    observer.listen(60.0, newest=True)
+    observer.listen(60.0, newest=True)
+    assert 0.1 < time.monotonic() - began < 30.0
+
+
 def test_one_operator_at_a_time_and_observers_who_give_no_orders(hexapod):
     with running(hexapod) as run, run.operator(name="panel") as operator:
         with pytest.raises(ChannelError, match="panel operates this run, and only one may") as refused:
@@ -428,6 +438,7 @@ def test_one_operator_at_a_time_and_observers_who_give_no_orders(hexapod):
             observer.watch(20.0)
             observer.listen(0.5)
             assert observer.telemetry["mode"] == "preparing" and observer.telemetry["commanded"]["position"][2] == 0.35
+            listen_to_the_newest(observer)
             for order in ("move", "jog", "stop", "end", "emergency", "beat"):
                 with pytest.raises(RequestRefusedError, match="an observer gives no orders"):
                     observer.ask(order)
