@@ -1,7 +1,6 @@
 """Who may open the panel, over real connections; and what a state becomes in words and colours."""
 
 import http.client
-import socket
 
 import numpy as np
 import pytest
@@ -27,14 +26,9 @@ from hil.runs.telemetry import (  # noqa: E402
 )
 from plant.errors import InputError  # noqa: E402
 from plant.pose import Pose  # noqa: E402
+from tests.hil.ports import free_port  # noqa: E402
 
 TOKEN = "0123456789abcdef0123"
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="module", params=[None, TOKEN], ids=["open", "token"])

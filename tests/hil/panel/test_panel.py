@@ -2,7 +2,6 @@
 
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,6 +12,7 @@ import pytest
 
 from hil.runs.operator import Operator
 from hil.runs.operator_messages import ChannelError
+from tests.hil.ports import free_port
 
 playwright = pytest.importorskip("playwright.sync_api")
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -24,12 +24,6 @@ _FLAGS = [
 ]  # fmt: skip
 DESK, PHONE = {"width": 760, "height": 560}, {"width": 380, "height": 640}
 """Small, as software draws them."""
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def started(*arguments):

@@ -13,7 +13,7 @@ from hil.panel.starting import RunForm, StartedRun
 from hil.runs.config import SimulationConfig
 from hil.runs.operator import Operator
 from plant.errors import InputError
-from tests.hil.runs.test_hardware_in_the_loop import free_port
+from tests.hil.ports import free_port
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -3,7 +3,6 @@
 import ctypes
 import json
 import re
-import socket
 import subprocess
 import sys
 import threading
@@ -39,6 +38,7 @@ from hil.runs.executive import RunStoppedError, run
 from hil.runs.prepare import prepared_loop, rig_of
 from plant.errors import InputError, UnknownNameError
 from plant.mechanism import load_spatial
+from tests.hil.ports import free_port
 
 PERIOD = 0.005
 CONFIG = SimulationConfig(target="sines", duration=1.0, rate=500.0)
@@ -47,12 +47,6 @@ HEXAPOD = load_spatial("hexapod")
 on_virtual_time = pytest.mark.usefixtures("virtual_time")
 ESTIMATES = ("position", "rotation", "covariance", "residuals", "conditioning", "lengths", "imus", "trusted", "sample_age")
 FOLLOWED = ("reference", "command", "mode", "stop", "request")
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind(("127.0.0.1", 0))
-        return opened.getsockname()[1]
 
 
 def findings_between_processes(*rigs, **more):

@@ -61,6 +61,7 @@ from hil.runs.config import EmulatorConfig, SimulationConfig
 from hil.runs.emulator_process import _rig_of
 from plant.compiled import kernel
 from plant.errors import InputError
+from tests.hil.ports import free_port
 
 SOURCES = Path(hil.rigs.udp.__file__).parent
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "rigs.md"
@@ -144,12 +145,6 @@ def test_the_documented_rates_are_those_that_the_buses_carry():
 
 
 # Rigs in other processes.
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind(("127.0.0.1", 0))
-        return opened.getsockname()[1]
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from hil.runs.operator import Operator, RequestRefusedError
 from hil.runs.operator_messages import ChannelError
 from plant.errors import InputError
 from plant.mechanism import load_in_space
-from tests.hil.runs.test_hardware_in_the_loop import free_port
+from tests.hil.ports import free_port
 from tests.hil.runs.test_operated_run import command, ready
 
 TOKEN = "0123456789abcdef0123"

@@ -29,7 +29,7 @@ from hil.runs.executive import RunStoppedError, run
 from hil.runs.prepare import prepared_loop
 from plant.errors import GoughError, InputError
 from plant.mechanism import load_mechanism
-from tests.hil.runs.test_hardware_in_the_loop import free_port
+from tests.hil.ports import free_port
 
 ROOT = os.geteuid() == 0
 CONFIG = SimulationConfig(target="sines", duration=1.0, rate=500.0)

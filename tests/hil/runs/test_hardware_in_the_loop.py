@@ -4,7 +4,6 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,6 +22,7 @@ from hil.rigs.udp.emulator import WATCHDOG_CODE
 from hil.runs.emulator_process import BusyError, ask
 from plant.errors import GoughError
 from plant.truth import TRUTH_LENGTHS
+from tests.hil.ports import free_port
 
 MOTION = ("--target", "sines", "--rate", "500")
 PATIENT = ("--most-missed", "2000", "--mechanism", str(Path(__file__).with_name("patient.toml")))
@@ -32,12 +32,6 @@ PATIENT = ("--most-missed", "2000", "--mechanism", str(Path(__file__).with_name(
 def gough(*arguments, **options):
     command = [sys.executable, "-m", "hil.command_line", *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
-
-
-def free_port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def wait_for(condition, seconds=120.0):

@@ -17,7 +17,8 @@ from hil.recording.replay import replay
 from hil.runs.operator import Operator
 from hil.runs.operator_messages import ChannelError
 from plant.mechanism import load_mechanism
-from tests.hil.runs.test_hardware_in_the_loop import PATIENT, emulated, free_port
+from tests.hil.ports import free_port
+from tests.hil.runs.test_hardware_in_the_loop import PATIENT, emulated
 
 pytestmark = pytest.mark.slow(seconds=60)
 
