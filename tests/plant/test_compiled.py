@@ -192,7 +192,7 @@ def test_a_cache_that_cannot_be_written_gives_way_to_temporary_files(monkeypatch
 
 
 def test_machine_code_is_kept_in_the_cache_alone(tmp_path: Path) -> None:
-    """A fresh process compiles into the cache folder, and the next one compiles nothing, nor does one on a copy of the sources."""
+    """A fresh process compiles into the cache folder; the next one compiles nothing, nor does one on a copy of the sources."""
     code = (
         "import numpy as np; from plant.pose import rotation_from_quaternion as r; r(np.array([1.0, 0.0, 0.0, 0.0]));"
         "print(sum(r.stats.cache_hits.values()), sum(r.stats.cache_misses.values()))"
