@@ -1,8 +1,8 @@
 """The one decorator that marks compiled kernels.
 
 numba notices no edit in the files of a kernel's callees. The machine code therefore lies in the user's cache under a hash of
-every source file of the three packages: any edit gives a new folder. Copies of the same sources, such as a checkout and what
-was installed from it, share the machine code.
+every source file of the three packages: any edit gives a new folder. Copies of the same sources share it, such as a checkout
+and what was installed from it.
 """
 
 import hashlib

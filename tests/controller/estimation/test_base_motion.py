@@ -57,9 +57,8 @@ class Sea:
         h = 1e-3
         before, now, after = (self.attitudes(times + k * h) for k in (-1, 0, 1))
         to_base = np.swapaxes(now, 1, 2)
-        ahead, behind = (
-            Rotation.from_matrix(turn).as_rotvec() / h for turn in (to_base @ after, np.swapaxes(before, 1, 2) @ now)
-        )
+        turns = to_base @ after, np.swapaxes(before, 1, 2) @ now
+        ahead, behind = (Rotation.from_matrix(turn).as_rotvec() / h for turn in turns)
         at = [self.places(times + k * h) + attitude @ self.arm for k, attitude in ((-1, before), (0, now), (1, after))]
         force = (at[2] - 2.0 * at[1] + at[0]) / h**2 + GRAVITY * UP
         return np.stack([0.5 * (ahead + behind), (ahead - behind) / h, (to_base @ force[:, :, None])[:, :, 0]], axis=1)

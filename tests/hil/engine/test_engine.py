@@ -7,9 +7,10 @@ import sys
 import time
 from functools import partial
 
+import hypothesis
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hil.engine.batches import Failure
@@ -64,7 +65,7 @@ def test_results_come_in_the_order_of_the_items_whatever_their_times(engine):
     assert engine.map(late, []) == []
 
 
-@settings(max_examples=20)
+@hypothesis.settings(max_examples=20)
 @given(items=st.lists(st.floats() | st.text() | st.tuples(st.integers(), st.booleans()), max_size=10))
 def test_every_item_has_one_result_in_its_place(engine, items):
     assert engine.map(repr, items) == list(map(repr, items))
