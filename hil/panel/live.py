@@ -18,7 +18,7 @@ from typing import Any
 
 import viser
 
-from hil.panel.readings import Readings, set_text, status
+from hil.panel.readings import Readings, set_text, set_theme, status
 from hil.panel.scene import Machine, Scene
 from hil.runs.operator import BEAT_S, Operator, RequestRefusedError
 from hil.runs.operator_messages import ChannelError
@@ -89,7 +89,7 @@ class LivePanel:
 
     def _build(self) -> None:
         gui = self._server.gui
-        gui.configure_theme(control_layout="collapsible", control_width="medium", show_logo=False, show_share_button=False)
+        set_theme(gui)
         self._status = gui.add_markdown("preparing")
         self._operating = gui.add_markdown("nobody operates from this panel")
         self._control = self._button("Take control", lambda client: self._orders.take(client), color="blue")

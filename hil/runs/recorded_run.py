@@ -126,7 +126,7 @@ def recorded_run(paths: Sequence[Path], mechanism: str | None = None) -> Recorde
         loaded = load_in_space(named)
     except GoughError as error:
         raise InputError(f"the mechanism of the recording {first.path}: {error}; name it with --mechanism") from None
-    events = sorted(event for recording in recordings for event in recording.events)
+    events = sorted({event for recording in recordings for event in recording.events})
     return RecordedRun(_as_assumed(loaded, first), first.config, records, 1.0 / float(first.config["rate"]), events)
 
 
