@@ -20,7 +20,7 @@ import viser
 
 from controller.frames import BASE, PLATFORM
 from hil.panel.margins import MARGINS_S, MarginTable
-from hil.panel.readings import Readings, event_list, set_text
+from hil.panel.readings import Readings, event_list, set_text, set_theme
 from hil.panel.scene import Machine, Scene
 from hil.runs.operator import BEAT_S, Operator, RequestRefusedError
 from hil.runs.operator_messages import RUN_ENDED, ChannelError
@@ -97,7 +97,7 @@ class LivePanel:
 
     def _build(self) -> None:
         gui = self._server.gui
-        gui.configure_theme(control_layout="collapsible", control_width="medium", show_logo=False, show_share_button=False)
+        set_theme(gui)
         self._status = gui.add_markdown("preparing")
         gui.add_markdown(f"{self.machine.name} follows {self._run['target']}")
         if self._run["operated"]:

@@ -7,7 +7,7 @@ from typing import Any
 import viser
 
 from hil.panel.margins import MARGINS_S, MarginTable
-from hil.panel.readings import Readings
+from hil.panel.readings import Readings, set_theme
 from hil.panel.scene import Machine, Scene
 from hil.runs.recorded_run import RecordedRun
 from hil.runs.telemetry import frames_message, machine_message
@@ -24,7 +24,7 @@ class Playback:
         machine = Machine.of_message(machine_message(run.mechanism))
         self._scene = Scene(server, machine)
         gui = server.gui
-        gui.configure_theme(control_layout="collapsible", control_width="medium", show_logo=False, show_share_button=False)
+        set_theme(gui)
         status = gui.add_markdown("")
         self._time: Any = gui.add_slider("Time [s]", 0.0, max(run.duration, run.period), run.period, 0.0)
         self._playing = gui.add_checkbox("Play", True)

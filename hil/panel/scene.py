@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from hil.look import (
     BASE_COLOR,
@@ -133,7 +134,7 @@ class Scene:
             self._legs.points = np.stack([machine.base_joints, ends], axis=1).astype(np.float32)
             if "lengths" in state:
                 colors = leg_colors(machine.shares(state, self.coloring))
-                self._legs.colors = np.repeat(colors[:, None], 2, axis=1)
+                self._legs.colors = np.repeat(_linear(colors)[:, None], 2, axis=1)
 
     def _place(self, poses: Mapping[str, Pose]) -> None:
         quaternions = quaternion_from_rotation(np.reshape([pose.rotation for pose in poses.values()], (-1, 3, 3)))
@@ -147,6 +148,13 @@ def _look(state: Mapping[str, Any], coloring: str) -> tuple[Any, ...]:
     numbers = [value for pose in poses if pose for value in (*pose["position"], *pose["rotation"])]
     numbers += [0.01 * (value or 0.0) for value in state.get("rates", ())]
     return coloring, [pose is None for pose in poses], state.get("imus"), np.round(numbers, 5).tolist()
+
+
+def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Colours (n, 3) for lines of several colours, which the library takes for linear ones, and would draw pale."""
+    shares = colors / 255.0
+    linear = np.where(shares <= 0.04045, shares / 12.92, ((shares + 0.055) / 1.055) ** 2.4)
+    return np.round(255.0 * linear).astype(np.uint8)
 
 
 def _plate(server: viser.ViserServer, name: str, joints: Array, color: str, opacity: float) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 
-from hil.look import COLORS, LEG_NAMES, NEUTRAL, ring
+from hil.look import BASE_COLOR, COLORS, LEG_NAMES, NEUTRAL, PLATFORM_COLOR, ring
 from hil.reports import view
 from hil.reports.page import LAYOUT, figure_html, overview, write_page
 from hil.studies.classification import PAPER, Description, Need, joints_about, planar_home
@@ -100,9 +100,10 @@ def _planar_view(mechanism: PlanarMechanism) -> go.Figure:
     joints = 1e3 * joints_about(mechanism, center + spread * across, 0.0)
     base = 1e3 * mechanism.base_joints
     figure = go.Figure()
-    for name, points in (("base", base), ("platform", joints)):
+    for name, points, color in (("base", base, BASE_COLOR), ("platform", joints, PLATFORM_COLOR)):
         closed = points[[0, 1, 2, 0]]
-        figure.add_scatter(x=closed[:, 0], y=closed[:, 1], name=name, mode="lines+markers", line={"width": 5})
+        line = {"color": color, "width": 5}
+        figure.add_scatter(x=closed[:, 0], y=closed[:, 1], name=name, mode="lines+markers", line=line)
     for k in range(PLANAR_LEGS):
         figure.add_scatter(
             x=[base[k, 0], joints[k, 0]], y=[base[k, 1], joints[k, 1]], name=LEG_NAMES[k], mode="lines",

@@ -112,7 +112,7 @@ dt { color: var(--faint); font-size: 13px; }
 figure { margin: 0; min-width: 0; }
 figure.time { margin-top: 32px; border-top: 1px solid var(--line); padding-top: 18px; }
 .pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 28px; }
-table + figure { margin-top: 22px; }
+table + figure, table + h2, dl + h2 { margin-top: 26px; }
 figcaption { color: var(--faint); font-size: 13px; }
 .js-plotly-plot :is([class$="tick"] text, [class$="title"], .legendtext) { fill: var(--faint) !important; }
 .js-plotly-plot .updatemenu-item-rect { fill: var(--ground) !important; stroke: var(--line) !important; }

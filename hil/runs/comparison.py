@@ -242,8 +242,7 @@ def compare(sources: Sequence[Path | str], reference: Path | str | None = None, 
     names = _short_names(named)
     runs = tuple(each.cut(name, seconds) for each, name in zip(loaded, names, strict=True))
     chosen = runs[0 if reference is None else named.index(str(reference))]
-    comparison = Comparison(runs, chosen, seconds, ())
-    return Comparison(runs, chosen, seconds, tuple(_remarks(comparison, lengths)))
+    return Comparison(runs, chosen, seconds, tuple(_remarks(runs, lengths, seconds)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -385,8 +384,8 @@ def _short_names(sources: Sequence[str]) -> list[str]:
     return short if len({*short}) == len(short) else list(sources)
 
 
-def _remarks(comparison: Comparison, lengths: Sequence[float]) -> Iterator[str]:
-    runs, seconds = comparison.runs, comparison.seconds
+def _remarks(runs: Sequence[ComparedRun], lengths: Sequence[float], seconds: float) -> Iterator[str]:
+    """What limits the comparison of runs with motions of these lengths [s] over so many seconds."""
     longer = {run: length for run, length in zip(runs, lengths, strict=True) if length - seconds > _TOLERANCE_S}
     cut = [f"{run.name} has {length:.3f} s" for run, length in longer.items() if run.course is not None]
     if cut:
@@ -397,7 +396,7 @@ def _remarks(comparison: Comparison, lengths: Sequence[float]) -> Iterator[str]:
     of_run = [run.name for run in runs if run.kind == "run"]
     if of_run:
         yield f"the times, missed periods and protection level of {', '.join(of_run)} are of the whole run, with the hold"
-    if not comparison.one_mechanism:
+    if len({run.config["mechanism"] for run in runs}) > 1:
         yield "the runs are of different mechanisms: the lengths of their legs are not compared"
 
 

@@ -136,7 +136,7 @@ def recorded_run(paths: Sequence[Path], mechanism: str | None = None) -> Recorde
     except GoughError as error:
         raise InputError(f"the mechanism of the recording {first.path}: {error}; name it with --mechanism") from None
     config, assumed = first.config, _as_assumed(loaded, first)
-    events = sorted(event for recording in recordings for event in recording.events)
+    events = sorted({event for recording in recordings for event in recording.events})
     frames = ActiveFrames(parse_frames(config.get("frame_definitions", ""), f"the frames in {first.path}"))
     demands = Demands(
         imus=imus_of(assumed, config["imus"]), magnetometer=config["magnetometer"], section_5=config["fusion"] == "section-5"

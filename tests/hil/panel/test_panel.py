@@ -10,8 +10,10 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from hil.look import leg_colors, stroke_shares
 from hil.runs.operator import Operator
 from hil.runs.operator_messages import ChannelError
+from hil.runs.recorded_run import recorded_run
 from tests.hil.ports import free_port
 
 playwright = pytest.importorskip("playwright.sync_api")
@@ -115,14 +117,26 @@ def press(page, name):
     page.get_by_role("button", name=name, exact=True).click()
 
 
-def drawn(page, tmp_path):
-    """How many colours the picture has left of the controls."""
+def colors_in(page, tmp_path):
+    """The colours (n, 3) that the picture has left of the controls, and how many pixels each has."""
     from PIL import Image
 
     path = tmp_path / "page.png"
     page.screenshot(path=str(path))
     picture = np.asarray(Image.open(path).convert("RGB"))[150:, : page.viewport_size["width"] // 2]
-    return len(np.unique(picture.reshape(-1, 3), axis=0))
+    return np.unique(picture.reshape(-1, 3), axis=0, return_counts=True)
+
+
+def drawn(page, tmp_path):
+    """How many colours the picture has left of the controls."""
+    return len(colors_in(page, tmp_path)[0])
+
+
+def has_colors(page, tmp_path, wanted):
+    """Whether the picture has some pixels of about each of the colours (n, 3); the scene has a light of its own."""
+    colors, counts = colors_in(page, tmp_path)
+    off = np.abs(colors.astype(int)[:, None] - wanted.astype(int)).max(axis=2)
+    return all(counts[near].sum() > 20 for near in (off < 24).T)
 
 
 def test_a_browser_operates_a_run_and_a_second_one_does_not(chromium, tmp_path):
@@ -271,6 +285,10 @@ def play(chromium, recording, tmp_path):
         page.get_by_text("idle").wait_for()
         for name in ("estimate", "reference", "truth"):
             page.get_by_role("cell", name=name).wait_for()
+        shown = recorded_run([recording])
+        lengths = shown.records["lengths"][shown.at(0.1), : shown.mechanism.legs]
+        legs = leg_colors(stroke_shares(lengths, shown.mechanism.require_limits().stroke))
+        assert waited(lambda: has_colors(page, tmp_path, legs))
 
 
 def seek(page, seconds):

@@ -194,6 +194,14 @@ def test_the_joints_are_those_that_the_controller_assumed(folder):
         compare([folder / "long.mcap", folder / "short.mcap"], None, "planar-3rpr")
 
 
+def test_the_files_of_one_recording_are_one_run(folder, tmp_path):
+    shutil.copy(folder / "long.mcap", tmp_path / "again.mcap")
+    whole = compare([folder / "long.mcap", folder / "short.mcap"])
+    parts = compare([f"{folder / 'long.mcap'},{tmp_path / 'again.mcap'}", folder / "short.mcap"])
+    assert parts.runs[0].figures == whole.runs[0].figures and parts.runs[0].events == whole.runs[0].events
+    assert [run.name for run in parts.runs] == ["long.mcap", "short.mcap"]
+
+
 def test_what_is_no_run_is_refused(folder, tmp_path):
     (tmp_path / "bench.json").write_text('{"version": "0.2.0", "stages_us": {}}')
     (tmp_path / "text.json").write_text("no JSON")
