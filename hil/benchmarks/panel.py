@@ -260,8 +260,8 @@ class _Mover:
 def _operated_run(recording: Path, summary: Path) -> Iterator[tuple[Operator, str]]:
     """A run that is under way; yields its operator and the address of its channel. It ends by a controlled stop."""
     address = f"127.0.0.1:{_free_port()}"
-    # However long the host holds it up, it goes on.
-    options = ["--rate", f"{_RATE:g}", "--duration", "36000", "--most-missed", "1000000"]
+    # However long the host holds it up, it goes on; it ends some time even if this process is killed.
+    options = ["--rate", f"{_RATE:g}", "--duration", "600", "--most-missed", "1000000"]
     files = ["--record", str(recording), "--json", str(summary)]
     with _command("run", "--target", f"operator:{address}", *options, *files) as run:
         _await(lambda: run.poll() is not None or _moves(address), "the run does not begin", _START_S)
