@@ -3,9 +3,8 @@ SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
 OUT := out
-WORKERS ?= 2
-# Of slow tests: many of them wait.
-SLOW_WORKERS ?= 3
+# One more than two processors: many tests wait.
+WORKERS ?= 3
 
 comma := ,
 
@@ -34,7 +33,7 @@ test: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "not slow and not endurance"
 
 test-all: test
-	$(BIN)/pytest -n $(SLOW_WORKERS) --dist worksteal -m "slow or hypothesis" --hypothesis-profile=all --durations=15
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "slow or hypothesis" --hypothesis-profile=all --durations=25
 
 test-endurance: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m endurance

@@ -145,7 +145,7 @@ class CycleStage(IntEnum):
     Python calls kernels with their `value`: numba takes 30 us to tell a member of an enumeration, and compiles anew for it.
     """
 
-    SCREENING, LEGS, PLATFORM, HEADING, POSE, REFINEMENT, MECHANISM, INTEGRITY, CONTROL, END = range(10)
+    SCREENING, LEGS, PLATFORM, HEADING, POSE, REFINEMENT, MECHANISM, INTEGRITY, CONTROL, WATCH, END = range(11)
 
 
 MARKS = record_dtype(ns=(np.int64, CycleStage.END), timespec=(np.int64, 2))
@@ -316,11 +316,12 @@ def run_stages(
 ) -> int:
     """The stages of a cycle from `first` up to but not including `last`; arguments and result as for `cycle`.
 
-    After `CONTROL` the cycle is over. Whoever leaves out that stage counts the cycle itself.
+    `CONTROL` ends with the commands, which `WATCH` judges. After that the cycle is over: whoever leaves out that stage counts
+    the cycle itself. After a fault, a cycle that begins only ramps the commands down.
     """
     p, s, m = parameters[()], state[()], marks
     rig, time = p.rig, s.time
-    if s.safety.mode == Mode.FAULT:
+    if first == CycleStage.SCREENING and s.safety.mode == Mode.FAULT:
         ramp_down(p.safety.stop, rig, time, s.pid)
         return Cause.NONE.value
     t = now(m.timespec)
@@ -392,10 +393,14 @@ def run_stages(
         if s.pose.found != 0:
             _check_integrity(parameters, state)
         t = _mark(m, CycleStage.INTEGRITY, t)
-    cause = Cause.NONE.value
     if first <= CycleStage.CONTROL < last:
-        cause = _control(parameters, state, segments) if s.pose.found != 0 else _lose_pose(parameters, state)
-        _mark(m, CycleStage.CONTROL, t)
+        if s.pose.found != 0:
+            _control(parameters, state, segments)
+        t = _mark(m, CycleStage.CONTROL, t)
+    cause = Cause.NONE.value
+    if first <= CycleStage.WATCH < last:
+        cause = _watch(parameters, state) if s.pose.found != 0 else _lose_pose(parameters, state)
+        _mark(m, CycleStage.WATCH, t)
     return cause
 
 
@@ -432,8 +437,8 @@ def _mark(m: Record, stage: int, began: int) -> int:
 
 
 @kernel
-def _control(parameters: Record, state: Record, segments: Array) -> int:
-    """From the pose to the commands; returns the cause of a fault, or `Cause.NONE`."""
+def _control(parameters: Record, state: Record, segments: Array) -> None:
+    """From the pose to the commands."""
     p, s = parameters[()], state[()]
     rig, time, pose = p.rig, s.time, s.pose
     legs_at(
@@ -446,12 +451,26 @@ def _control(parameters: Record, state: Record, segments: Array) -> int:
     for k in range(rig.legs):
         s.pid.error[k] = s.reference.motion[k, 0] - pose.lengths[k]
     arming.run_arming_checks(p.safety, s.safety, rig, time, p.imus, s.imus, s.integrity, pose, s.reference, s.pid)
-    if s.safety.request != Request.ENABLED or s.safety.mode < Mode.RUNNING:
+    if not follows_commands(s.safety):
         pid.hold_still(s.pid, rig.legs)
     else:
         up, gravity = base_imu.vertical(p.base, s.base, rig)
         load_feed_forward.find_feed_forward(p.load, s.load, rig, pose, s.reference, up, gravity)
         pid.step_pid(p.pid, s.pid, s.load.feed_forward, elapsed(rig, time))
+
+
+@kernel
+def follows_commands(safety: Record) -> bool:
+    """Whether the drives follow the commands."""
+    return bool(safety.request == Request.ENABLED and safety.mode >= Mode.RUNNING)
+
+
+@kernel
+def _watch(parameters: Record, state: Record) -> int:
+    """Judge the estimate and the commands; returns the cause of a fault, or `Cause.NONE`."""
+    p, s = parameters[()], state[()]
+    rig, time, pose = p.rig, s.time, s.pose
+    if follows_commands(s.safety):
         watch.check_oscillation(
             p.safety, s.safety, rig, time, s.imus.shaking, s.load.feed_forward, s.reference, s.pid
         )  # fmt: skip

@@ -5,7 +5,8 @@
     result = simulate(SimulationConfig(target="sines", duration=5.0))
     print(result.summary()["estimation"]["position_rms"])
 
-A run on the machine's clock, as `gough run`:
+Targets as functions, stages of your own, loops that you step, and signals for xarray: docs/python.md. A run on the machine's
+clock, as `gough run`:
 
     from pathlib import Path
 
@@ -29,6 +30,12 @@ The best design within bounds, as `gough optimise` (docs/optimisation.md):
     with open_engine() as engine:
         print(optimise(read_design("design.toml"), Path("design.results"), engine).knee)
 
+Runs beside each other, as `gough compare` (docs/compare.md):
+
+    from hil import compare
+
+    print(compare(["before.json", "after.mcap"]).differing())
+
 Whatever refuses its input raises a `GoughError`. This package loads nothing until a name is used.
 """
 
@@ -40,13 +47,17 @@ if TYPE_CHECKING:
     from hil.calibration.procedure import calibrate_recordings, calibrate_rig
     from hil.engine.engine import open_engine
     from hil.engine.settings import EngineSettings
+    from hil.loop.own_stages import Cycle, Stages
     from hil.realtime.scheduling import RealTimeSettings
     from hil.recording.replay import replay
-    from hil.reports.run import write_report
+    from hil.reports.run import figures, write_report
+    from hil.runs.comparison import Comparison, compare
     from hil.runs.config import SimulationConfig
+    from hil.runs.dataset import dataset, frame
     from hil.runs.executive import RunStoppedError, run
+    from hil.runs.operator import Operator
     from hil.runs.run_state import RunState
-    from hil.runs.simulation import SimulationResult, SimulationStoppedError, simulate
+    from hil.runs.simulation import Simulation, SimulationResult, SimulationStoppedError, open_simulation, simulate
     from hil.runs.snapshot import Snapshot, read_snapshot, write_snapshot
     from hil.sweep.design import Design, read_design
     from hil.sweep.function import UserFunction
@@ -59,11 +70,12 @@ if TYPE_CHECKING:
     from plant.mechanism import Mechanism, PlanarMechanism, load_mechanism
 
 __all__ = [
-    "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "OptimisationResult", "PlanarMechanism",
-    "RealTimeSettings", "RunState", "RunStoppedError", "Sampling", "Setting", "SimulationConfig", "SimulationResult",
-    "SimulationStoppedError", "Snapshot", "Study", "SweepResult", "UserFunction", "Wiring", "calibrate_recordings",
-    "calibrate_rig", "load_mechanism", "open_engine", "optimise", "read_design", "read_snapshot", "read_study", "replay", "run",
-    "run_study", "simulate", "write_report", "write_snapshot",
+    "Comparison", "Cycle", "Design", "EngineSettings", "Factor", "GoughError", "Knowledge", "Mechanism", "Operator",
+    "OptimisationResult", "PlanarMechanism", "RealTimeSettings", "RunState", "RunStoppedError", "Sampling", "Setting",
+    "Simulation", "SimulationConfig", "SimulationResult", "SimulationStoppedError", "Snapshot", "Stages", "Study",
+    "SweepResult", "UserFunction", "Wiring", "calibrate_recordings", "calibrate_rig", "compare", "dataset", "figures", "frame",
+    "load_mechanism", "open_engine", "open_simulation", "optimise", "read_design", "read_snapshot", "read_study", "replay",
+    "run", "run_study", "simulate", "write_report", "write_snapshot",
 ]  # fmt: skip
 
 _HOMES = {
@@ -71,13 +83,17 @@ _HOMES = {
     "hil.calibration.procedure": ("calibrate_recordings", "calibrate_rig"),
     "hil.engine.engine": ("open_engine",),
     "hil.engine.settings": ("EngineSettings",),
+    "hil.loop.own_stages": ("Cycle", "Stages"),
     "hil.realtime.scheduling": ("RealTimeSettings",),
     "hil.recording.replay": ("replay",),
-    "hil.reports.run": ("write_report",),
+    "hil.reports.run": ("figures", "write_report"),
+    "hil.runs.comparison": ("Comparison", "compare"),
     "hil.runs.config": ("SimulationConfig",),
+    "hil.runs.dataset": ("dataset", "frame"),
     "hil.runs.executive": ("RunStoppedError", "run"),
+    "hil.runs.operator": ("Operator",),
     "hil.runs.run_state": ("RunState",),
-    "hil.runs.simulation": ("SimulationResult", "SimulationStoppedError", "simulate"),
+    "hil.runs.simulation": ("Simulation", "SimulationResult", "SimulationStoppedError", "open_simulation", "simulate"),
     "hil.runs.snapshot": ("Snapshot", "read_snapshot", "write_snapshot"),
     "hil.sweep.design": ("Design", "read_design"),
     "hil.sweep.function": ("UserFunction",),

@@ -2,11 +2,36 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from os import PathLike
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from plant.errors import InputError
 
 T = TypeVar("T")
+
+
+class Named(Generic[T]):
+    """The type of a field that is given a name, a path or an object T, and then is the name."""
+
+    if TYPE_CHECKING:
+
+        def __get__(self, instance: object, owner: type | None = None) -> str:
+            """The name."""
+
+        def __set__(self, instance: object, value: str | PathLike[str] | T) -> None:
+            """Anything that can be named."""
+
+
+class NamedOrNone(Generic[T]):
+    """The same for a field that may be None."""
+
+    if TYPE_CHECKING:
+
+        def __get__(self, instance: object, owner: type | None = None) -> str | None:
+            """The name, or None."""
+
+        def __set__(self, instance: object, value: str | PathLike[str] | T | None) -> None:
+            """Anything that can be named, or None."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +53,11 @@ def option(default: T, text: str, **form: Any) -> T:
     """A dataclass field with this default in SI units, and its option."""
     made: T = field(default=default, metadata={"option": Option(text, **form)})
     return made
+
+
+def named(default: str | None, text: str, **form: Any) -> Any:
+    """An `option` whose field is `Named` or `NamedOrNone`."""
+    return option(default, text, **form)
 
 
 def integers(text: str) -> tuple[int, ...]:

@@ -15,14 +15,14 @@ EXTRAS = {
     "distributed": "sweep",
     "filterpy": "studies",
     "optuna": "sweep",
-    "pandas": "sweep",
+    "pandas": "notebook",
     "plotly": "reports",
     "pyarrow": "sweep",
     "scipy": "calibrate",
     "tomlkit": "studies",
     "viser": "panel",
     "vqf": "studies",
-    "xarray": "sweep",
+    "xarray": "notebook",
     "ziglang": "cross",
 }
 """The extra that installs each package."""

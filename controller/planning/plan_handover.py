@@ -57,10 +57,10 @@ STREAM_READER = record_dtype(
 
 
 def rest(lengths: Array, rows: int = FOLLOWED_SEGMENTS) -> Array:
-    """Segments (6, rows, 5) that stay at lengths (6,) [m] without end: the start of a stream."""
+    """Segments (6, rows, 5) that stay at lengths (n,) [m] of n legs without end, the others at 0: the start of a stream."""
     segments = np.zeros((LEGS, rows, 5))
     segments[:, 1:, START] = np.inf
-    segments[:, 0, LENGTH] = lengths
+    segments[: len(lengths), 0, LENGTH] = lengths
     return segments
 
 

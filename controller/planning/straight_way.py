@@ -45,7 +45,7 @@ class StraightWay:
         limits: of speed, acceleration and jerk of the move, at the pivot.
 
     Attributes:
-        lengths: (6,) [m], of the legs at its end.
+        lengths: (n,) [m], of the n legs at its end.
         stopped: whether it was asked to stop on the way.
 
     Raises:
@@ -94,7 +94,7 @@ class StraightWay:
         return self.poses(np.array(self.parameter(time)[0]))
 
     def at(self, ahead: float) -> tuple[Array, Array]:
-        """Lengths [m] and rates [m/s] (6,) of the legs at a time after the begin [s]; at rest the rates are exactly 0."""
+        """Lengths [m] and rates [m/s] (n,) of the legs at a time after the begin [s]; at rest the rates are exactly 0."""
         share, rate, _ = self.parameter(ahead)
         values = curve_at(self._legs, np.array([min(max(share, 0.0), 1.0)]))[:2, 0]
         return values[0], values[1] * rate

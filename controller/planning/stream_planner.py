@@ -69,10 +69,10 @@ class TargetRefusedError(GoughError, ValueError):
 class KnownMotion(Protocol):
     """A motion that is known beforehand, by the lengths of the legs."""
 
-    lengths: Array  # (6,) [m], at its end
+    lengths: Array  # (n,) [m], at its end
 
     def at(self, ahead: float) -> tuple[Array, Array]:
-        """Lengths [m] and rates [m/s] (6,) after a time [s]; at rest the rates are exactly 0."""
+        """Lengths [m] and rates [m/s] (n,) after a time [s]; at rest the rates are exactly 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +80,8 @@ class Plan:
     """A plan, in motion time."""
 
     begin: float  # when it takes over from the previous plan [s]
-    segments: Array  # (6, 24, 5), as `controller.planning.segments` has them
-    goal: Array | None  # (6,) [m], the lengths at which it ends if the target stands still there
+    segments: Array  # (6, 24, 5), as `controller.planning.segments` has them; legs that are not there stay at 0
+    goal: Array | None  # (n,) [m], the lengths at which it ends if the target stands still there
     near: Pose | None = None  # the pose at which it begins, if that has been found
 
 
@@ -95,8 +95,8 @@ class StreamPlanner:
     """Plans how to follow a stream of target poses, sample by sample.
 
     Args:
-        mechanism: with home and limits.
-        lengths: (6,) [m], at which the legs rest when the motion begins.
+        mechanism: with n legs, home and limits.
+        lengths: (n,) [m], at which the legs rest when the motion begins.
         frames: in which the samples are; None for displacements from home in {1}.
         guard: holds samples, and the poses of every plan to its end, against other limits than strokes and actuators.
 
@@ -119,14 +119,12 @@ class StreamPlanner:
         self._motion: TargetMotion | None = None
         self._known: KnownMotion | None = None
         self._sent_s = 0.0  # time stamp of the newest sample
-        self._within = lengths, lengths  # least and greatest lengths (6,) at that time that no sample so far makes a jump
-        self._otg = Ruckig(LEGS)
-        self._trajectory = Trajectory(LEGS)
+        self._within = lengths, lengths  # least and greatest lengths (n,) at that time that no sample so far makes a jump
+        self._otg = Ruckig(mechanism.legs)
+        self._trajectory = Trajectory(mechanism.legs)
         self._follow = ruckig_input(self._limits, ControlInterface.Position, None)
         # Loads the machine code now: between samples there is not enough time.
-        state = np.empty((LEGS, 3))
-        evaluate_reference(self.current.segments, 0.0, np.zeros(LEGS, np.int64), state)
-        self._plan_towards(0.0, state, lengths, None, PREVIEW_S)
+        self._plan_towards(0.0, self._state(0.0), lengths, None, PREVIEW_S)
         rotation_from_quaternion(np.array([1.0, 0.0, 0.0, 0.0]))
 
     def add(self, time_s: float, displacement: ArrayLike, quaternion: ArrayLike) -> None:
@@ -203,9 +201,7 @@ class StreamPlanner:
         motion = self._known or self._motion
         if motion is None:
             raise InputError("there is no sample to plan for: add one first")
-        state = np.empty((LEGS, 3))
-        evaluate_reference(self.current.segments, at_s, np.zeros(LEGS, np.int64), state)
-        ahead = max(ahead_s, 0.0)
+        state, ahead = self._state(at_s), max(ahead_s, 0.0)
         goal, rates = self._aim(motion, ahead + PREVIEW_S)
         if ended or not rates.any():
             goal = motion.lengths if ended else goal
@@ -223,8 +219,14 @@ class StreamPlanner:
         self.current = plan
         self._near = plan.near or self._near
 
+    def _state(self, at_s: float) -> Array:
+        """The state (n, 3) of the current plan at a time [s]."""
+        state = np.empty((LEGS, 3))
+        evaluate_reference(self.current.segments, at_s, np.zeros(LEGS, np.int64), state)
+        return state[: self._mechanism.legs]
+
     def _aim(self, motion: TargetMotion | KnownMotion, ahead: float) -> tuple[Array, Array]:
-        """Lengths and rates (6,) of the target `ahead` [s] of its newest sample, within the limits."""
+        """Lengths and rates (n,) of the target `ahead` [s] of its newest sample, within the limits."""
         limits = self._limits
         lengths, rates = motion.at(ahead)
         aim = np.clip(lengths, limits.stroke[:, 0], limits.stroke[:, 1])
@@ -234,13 +236,13 @@ class StreamPlanner:
         return aim, np.clip(rates, -most, most)
 
     def _plan_towards(self, begin: float, state: Array, aim: Array, rates: Array | None, preview: float) -> Plan | None:
-        """A plan from a state (6, 3) to the aim, to arrive after `preview` [s] with these rates, or at rest; None if limits,
+        """A plan from a state (n, 3) to the aim, to arrive after `preview` [s] with these rates, or at rest; None if limits,
         stroke or ruckig do not allow it.
         """
         follow, limits = self._follow, self._limits
         follow.minimum_duration = preview
         follow.target_position = aim.tolist()
-        follow.target_velocity = [0.0] * LEGS if rates is None else rates.tolist()
+        follow.target_velocity = [0.0] * len(aim) if rates is None else rates.tolist()
         if not calculate(self._otg, follow, state.T.tolist(), self._trajectory):
             return None
         if rates is not None and self._trajectory.duration > _TIMELY * preview:
@@ -249,7 +251,9 @@ class StreamPlanner:
         most = np.array([limits.acceleration, limits.jerk])
         for coast in (0.0,) if rates is None else (_COAST_S, 0.0):
             end = _write_plan(phases, begin, self._trajectory.duration, coast, state, most, segments)
-            if not count_violations(segments, end, limits) and (found := self._guarded(segments, begin, end)) is not None:
+            if count_violations(segments[: len(aim)], end, limits):
+                continue
+            if (found := self._guarded(segments, begin, end)) is not None:
                 return Plan(begin, segments, aim if rates is None else None, found)
         return None
 
@@ -258,7 +262,7 @@ class StreamPlanner:
         if self._guard is None:
             return self._near
         times = np.linspace(begin, end, max(2, ceil((end - begin) / _GUARDED_S) + 1))
-        lengths = np.empty((len(times), LEGS))
+        lengths = np.empty((len(times), self._mechanism.legs))
         lengths_along(segments, times, lengths)
         positions, rotations = poses_from_lengths(self._mechanism, lengths, self._near, partial=True)
         if not np.isfinite(positions[-1]).all() or self._guard(positions, rotations) is not None:
@@ -279,7 +283,7 @@ def _stoppable(room: Array, acceleration: float, jerk: float) -> Array:
 def _write_plan(
     phases: Array, begin: float, duration: float, coast: float, state: Array, limits: Array, segments: Array
 ) -> float:
-    """Write the segments (6, n, 5) of phases (6, 2, 9), durations and jerks, from a state (6, 3), then a coast and a stop.
+    """Write the segments (6, m, 5) of phases (n, 2, 9), durations and jerks, from a state (n, 3), then a coast and a stop.
     Returns the time at which all legs are at rest [s].
 
     Durations count between the rounded starts, so that each row ends exactly where the next one begins.
@@ -287,8 +291,9 @@ def _write_plan(
     count = phases.shape[2]
     segments[:, :, :] = 0.0
     segments[:, :, START] = np.inf
+    segments[phases.shape[0] :, 0, START] = begin
     end, arrived = begin, begin + duration
-    for leg in range(LEGS):
+    for leg in range(phases.shape[0]):
         row, now, at = 0, (state[leg, 0], state[leg, 1], state[leg, 2]), begin
         for k in range(count + 2):
             # The rest of ruckig's duration after its phases, and the coast, have no jerk.

@@ -1,10 +1,11 @@
 """Target motions: poses over time, from a CSV file, a motion file, or a built-in motion."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from controller.frames import ActiveFrames
 from controller.inverse_kinematics import leg_lengths
@@ -13,6 +14,7 @@ from controller.planning.motions import (
     MARGIN_S,
     MOTIONS,
     NAMES,
+    SAMPLE_PERIOD_S,
     Motion,
     PlannedMotion,
     load_motion,
@@ -28,9 +30,11 @@ from plant.pose import (
     UNIT_TOLERANCE,
     Array,
     Pose,
+    checked_array,
     checked_unit,
     quaternion_from_rotation,
     quaternions_along,
+    rotation_from_vector,
     rotations_from_quaternions,
 )
 
@@ -39,6 +43,12 @@ COLUMNS = ("time_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
 HELD_COLUMNS = ("from_s", *COLUMNS[1:])
 """Of poses that are held, each from its time on."""
+
+TargetFunction = Callable[[float], ArrayLike]
+"""A target as a function of the time [s], from 0 on: place (3,) [m] and rotation vector (3,) [rad], as one array (6,).
+
+They are those of a file: a displacement from home along the base's axes, or with frames the pose of the tool in the work frame.
+"""
 
 MOTION_SUFFIX = ".toml"
 """Of the name of a motion file."""
@@ -174,6 +184,25 @@ def load_target(
     if mechanism.planar:
         _check_in_plane(target, mechanism)
     return target
+
+
+def target_of_function(
+    function: TargetFunction, mechanism: Mechanism, duration: float, frames: ActiveFrames | None = None
+) -> Target:
+    """The target that a function of time describes, for a motion of `duration` [s].
+
+    It is sampled each 10 ms, as the planner samples every target.
+
+    Raises:
+        InputError: the function returns anything but six finite numbers.
+    """
+    check_duration(duration)
+    name = getattr(function, "__name__", type(function).__name__)
+    times = np.arange(0.0, duration + MARGIN_S + SAMPLE_PERIOD_S, SAMPLE_PERIOD_S)
+    samples = np.array([checked_array(function(float(time)), (6,), f"{name}({time:g})") for time in times])
+    rotations = np.array([rotation_from_vector(vector) for vector in samples[:, 3:]])
+    positions, rotations = poses_of(samples[:, :3], rotations, mechanism.require_home(), frames)
+    return Target(name, times, positions, rotations)
 
 
 def plan_in_frames(motion: Motion, mechanism: Mechanism, frames: ActiveFrames | None) -> PlannedMotion:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plant.mechanism import LEGS
 from plant.pose import Array
 
 _FITS = ((2, 0.08), (1, 0.08), (1, 0.25), (0, 0.25))
@@ -52,27 +51,27 @@ class _Slot:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Lengths (m, 6) by powers of the time since `time`."""
+    """Lengths (m, n) by powers of the time since `time`."""
 
     time: float
     powers: Array
     velocity: float  # the greatest [m/s]
 
     def at(self, time: float) -> tuple[Array, Array]:
-        """Lengths and rates (6,)."""
+        """Lengths and rates (n,)."""
         after = time - self.time
         curved = min(after, _CURVED_S)
-        place, rate, bend = np.vstack([self.powers, np.zeros((3 - len(self.powers), LEGS))])
+        place, rate, bend = np.pad(self.powers, ((0, 3 - len(self.powers)), (0, 0)))
         rates = np.clip(rate + 2.0 * curved * bend, -self.velocity, self.velocity)
         return place + curved * (rate + curved * bend) + (after - curved) * rates, rates
 
 
 class TargetMotion:
-    """The motion of a streamed target, by the lengths of the legs.
+    """The motion of a streamed target, by the lengths of n legs.
 
     Args:
         time: of the first sample [s].
-        lengths: (6,) [m], of the first sample.
+        lengths: (n,) [m], of the first sample.
         velocity: that a leg can have [m/s].
     """
 
@@ -85,7 +84,7 @@ class TargetMotion:
         self._judged, self._judged_at = 0, time
 
     def add(self, time: float, lengths: Array) -> None:
-        """Add a sample: its time [s], later than that of the last one, and its lengths (6,) [m]."""
+        """Add a sample: its time [s], later than that of the last one, and its lengths (n,) [m]."""
         self.time, self.lengths = time, lengths
         last = self._slots[-1]
         if time - last.begin < _SLOT_S:
@@ -95,10 +94,10 @@ class TargetMotion:
         self._slots.append(_Slot(time, time, lengths))
 
     def at(self, ahead: float) -> tuple[Array, Array]:
-        """Lengths and rates (6,) `ahead` [s] of the newest sample; a target that stands still has rates of exactly 0."""
+        """Lengths and rates (n,) `ahead` [s] of the newest sample; a target that stands still has rates of exactly 0."""
         recent = self._recent(_FITS[0][1])
         if np.ptp([slot.lengths for slot in recent], axis=0).max() < STILL_M:
-            return self.lengths, np.zeros(LEGS)
+            return self.lengths, np.zeros_like(self.lengths)
         errors = np.sqrt(self._errors)
         # Before any fit is judged, the calmest is best.
         best = int(np.argmax(errors <= _AS_GOOD * errors.min() + _AS_GOOD_M)) if self._judged else len(_FITS) - 1

@@ -1,6 +1,14 @@
 """Where a mechanism can go: margins of poses, travel along a direction, and the largest region about a pose."""
 
-from controller.workspace.check import Excess, PoseGuard, TargetCheck, check_against_limits, first_excess, pose_text
+from controller.workspace.check import (
+    Excess,
+    PoseGuard,
+    TargetCheck,
+    check_against_limits,
+    closest_limits,
+    first_excess,
+    pose_text,
+)
 from controller.workspace.extent import (
     AXES,
     Reach,
@@ -35,6 +43,7 @@ __all__ = [
     "TargetCheck",
     "Travel",
     "check_against_limits",
+    "closest_limits",
     "first_excess",
     "geometry_figures",
     "largest_box",

@@ -222,6 +222,15 @@ def first_excess(
     return tally.first
 
 
+def closest_limits(mechanism: Mechanism, pose: Pose, demands: Demands | None = None) -> list[tuple[float, Excess]]:
+    """Of each kind of limit the one that a pose is closest to or exceeds most, and its margin as a share of that with which it
+    is farthest away; the closest kind comes first.
+    """
+    tally = _Tally(mechanism, demands or USUAL)
+    tally.add(np.zeros(1), pose.position[None], pose.rotation[None])
+    return sorted(tally.closest.values(), key=lambda found: found[0])
+
+
 def _parts(times: Array) -> Iterable[Array]:
     return (times[k : k + _CHUNK] for k in range(0, len(times), _CHUNK))
 

@@ -175,7 +175,9 @@ def calibrate_guided(
                 save_calibration(file, data.with_base(at_rest.calibration()))
                 guide.tell(f"{len(data.readings)} poses at rest: {_expected(plan.mechanism, at_rest)}")
         with steps.next() as (step, due):
-            return finish(data, at_rest, [steps.records(step, due, open_loop=False)], None, validate)
+            shaken = steps.records(step, due, open_loop=False)
+            guide.tell("the platform rests; the constants are computed from all that was recorded, which takes up to a minute")
+            return finish(data, at_rest, [shaken], None, validate)
 
 
 def _begin(data: CalibrationData, records: Record) -> str:

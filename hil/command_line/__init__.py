@@ -17,7 +17,7 @@ REFUSED, INTERRUPTED = 2, 130
 """Exit statuses for bad input and for Ctrl-C; 1 is for a run that ended early."""
 
 COMMANDS = {
-    "run": ("simulate", "run", "motion", "replay", "stream-target", "vehicle"),
+    "run": ("simulate", "run", "motion", "replay", "compare", "stream-target", "vehicle"),
     "calibrate": ("calibrate", "identify"),
     "design": (
         "classify",
@@ -32,8 +32,7 @@ COMMANDS = {
         "optimise",
     ),
     "operate": ("move", "jog", "panel", "frames"),
-    "rigs": ("check-rig", "emulate", "inject"),
-    "plant": ("fmu",),
+    "rigs": ("check-rig", "emulate", "inject", "fmu"),
     "study": ("sweep", "compare-fusion", "evaluate-fusion", "faults", "planar", "broad"),
     "measure": ("bench",),
 }

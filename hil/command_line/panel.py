@@ -1,28 +1,19 @@
 """The command that shows a run or a recording in the browser, panel."""
 
 import signal
-import subprocess
 import sys
 import threading
-import time
 import webbrowser
 from argparse import REMAINDER, Namespace
-from collections.abc import Iterator
-from contextlib import contextmanager
 
+from controller.planning import OPERATOR_TARGET
 from hil.command_line import cli
 from hil.realtime.processes import signals_handled
 from hil.runs.config import OPERATOR_CHANNEL
-from plant.errors import GoughError, InputError
+from plant.errors import InputError
 
-_START_S = 180.0
-"""How long a run may take to begin: the first one compiles."""
-
-
-class _NotBegunError(GoughError, RuntimeError):
-    """The run that a panel has started has ended before it began."""
-
-    exit_status = 1
+_STARTED = ("--target", OPERATOR_TARGET, "--duration", "36000")
+"""What a run of the panel's own does, unless its options say otherwise."""
 
 
 @cli.command(
@@ -41,10 +32,10 @@ class _NotBegunError(GoughError, RuntimeError):
 def gough_panel(options: Namespace) -> None:
     """Show a run in the browser, live, and operate it; or play a recording.
 
-    A run that was started with 'gough run --target operator' is shown as it is estimated, with ghosts of where it should be
-    and, in simulation, of where it is. One browser at a time may take control: jog, go to points and places, stop. A browser
-    that goes away while it jogs ends the run by a controlled stop. The page stays on this machine unless --listen says
-    otherwise. Its quick stop is software, and no emergency stop.
+    Any run of 'gough run' is shown as it is estimated, with ghosts of where it should be and, in simulation, of where it is.
+    Where none runs, the page starts one. If it was started with --target operator, one browser at a time may take control: jog,
+    go to points and places, stop, pause. A browser that goes away while it jogs ends the run by a controlled stop. The page
+    stays on this machine unless --listen says otherwise. Its quick stop is software, and no emergency stop.
     """
     from hil.panel.access import close_server, open_server, panel_address
     from hil.runs.operator_messages import load_token
@@ -56,25 +47,24 @@ def gough_panel(options: Namespace) -> None:
     over = threading.Event()
     with signals_handled((signal.SIGINT, signal.SIGTERM), lambda number, frame: over.set()):
         if options.recording is not None:
-            from hil.panel.playback import Playback, recorded_run
+            from hil.panel.playback import Playback
+            from hil.runs.recorded_run import recorded_run
 
-            run = recorded_run(options.recording, options.mechanism)
+            run = recorded_run([options.recording], options.mechanism)
             server = open_server(host, port, token)
             _announce(options, host, port, token)
             Playback(server, run).run(over)
             close_server(server)
             return
-        from hil.panel.live import LivePanel
+        from hil.panel.page import Page
 
-        with _started_run(options, over):
-            server = open_server(host, port, token)
-            panel = LivePanel(server, options.at, load_token(options.token_file))
-            try:
-                _announce(options, host, port, token)
-                panel.run(over)
-            finally:
-                panel.close()
-                close_server(server)
+        server = open_server(host, port, token)
+        page = Page(server, options.at, load_token(options.token_file), options.token_file)
+        _announce(options, host, port, token)
+        try:
+            page.run(over, None if options.start is None else [*_STARTED, *options.start])
+        finally:
+            close_server(server)
 
 
 def _announce(options: Namespace, host: str, port: int, token: str | None) -> None:
@@ -85,33 +75,3 @@ def _announce(options: Namespace, host: str, port: int, token: str | None) -> No
         print("nothing is encrypted: whoever can read the network can read the token, and move the platform", file=sys.stderr)
     if not options.no_browser and sys.stdout.isatty():
         webbrowser.open(address)
-
-
-@contextmanager
-def _started_run(options: Namespace, over: threading.Event) -> Iterator[None]:
-    """A run of the panel's own, if one is asked for; it ends by a controlled stop."""
-    if options.start is None:
-        yield
-        return
-    from hil.runs.operator import Operator
-    from hil.runs.operator_messages import ChannelError, load_token
-
-    command = [sys.executable, "-m", "hil.command_line", "run", "--target", f"operator:{options.at}", "--duration", "36000"]
-    # Ctrl-C is for the panel, which ends the run.
-    run = subprocess.Popen([*command, *options.start], start_new_session=True)
-    try:
-        until = time.monotonic() + _START_S
-        while not over.is_set():
-            if run.poll() is not None:
-                raise _NotBegunError(f"the run ended with status {run.returncode} before it began: its last lines say why")
-            try:
-                Operator(options.at, load_token(options.token_file), role="observer").close()
-                break
-            except ChannelError:
-                if time.monotonic() > until:
-                    raise
-            time.sleep(0.2)
-        yield
-    finally:
-        run.terminate()
-        run.wait()

@@ -1,4 +1,4 @@
-"""The commands that run the loop, and what makes targets: simulate, run, motion, replay, stream-target, vehicle."""
+"""The commands that run the loop, and what makes targets: simulate, run, motion, replay, compare, stream-target, vehicle."""
 
 import sys
 from argparse import SUPPRESS, ArgumentTypeError, Namespace
@@ -29,6 +29,7 @@ _NOTICED_STRETCH = 1.05
     # A resumed run keeps what its snapshot was taken with, and must tell what is given from what is not.
     cli.options_of(SimulationConfig, *cli.names_of(SimulationConfig, *OF_RUNS), only_given=True),
     cli.report("write a report with plots and a moving 3-D view"),
+    cli.output("--picture", "FILE.svg", "draw the mechanism in motion: a picture that moves without a script"),
     cli.JSON,
     cli.output("--save-state", "FILE", "write a snapshot, from which a run can go on"),
     cli.argument(
@@ -66,6 +67,10 @@ def gough_simulate(options: Namespace) -> None:
     if stopped is None or result.moved:
         cli.write_json(options.json, result.summary())
         cli.write_report(options, "run", result)
+        if options.picture is not None:
+            from hil.reports.moving_picture import write_picture
+
+            write_picture(result, options.picture)
         _print_simulation(result.summary())
     if stopped:
         raise stopped
@@ -207,9 +212,11 @@ def _print_run(summary: dict[str, Any]) -> None:
         f"{used['involuntary_switches']} involuntary switches, {used['resident']} bytes of growth; "
         f"first cycle {summary['start_up_s']:.2f} s after the start"
     )
-    truth = f"estimate - truth {mm(errors['estimation'])} mm RMS" if errors["known"] else "the truth is not known"
+    truth = "the truth is not known"
+    if errors["known"]:
+        truth = f"estimate - truth {mm(errors['estimation'])} mm, {deg(summary['errors_rad']['estimation'])} deg RMS"
     if errors["known"] and (frames := summary.get("frames")):
-        truth += f", of {frames['tool']} {mm(errors['tool'])} mm RMS"
+        truth += f"; of {frames['tool']} {mm(errors['tool'])} mm RMS"
     print(f"{truth}; reference - length {mm(errors['tracking'])} mm RMS")
     if level := summary["protection"]:
         print(f"greatest protection level {mm(level['position'])} mm, {deg(level['rotation'])} deg")
@@ -368,6 +375,41 @@ def gough_replay(options: Namespace) -> int:
     for line in result.lines():
         print(line)
     return int(not result.same)
+
+
+@cli.command(
+    cli.argument(
+        "runs",
+        nargs="+",
+        metavar="FILE",
+        help="what 'gough simulate --json' or 'gough run --json' has written, or a recording, its files with commas in between",
+    ),
+    cli.argument("--reference", metavar="FILE", help="the run that the others are compared with (default: the first)"),
+    cli.argument("--mechanism", metavar="NAME", help="of the recordings, if its file has moved"),
+    cli.report("write a report with the tables, and the recordings on top of each other"),
+    cli.JSON,
+)
+def gough_compare(options: Namespace) -> None:
+    """Compare runs: configurations, errors, times.
+
+    Prints what differs in the configurations, and every figure that a run has, with its difference and ratio to the reference's
+    (docs/compare.md). Recordings are compared over the time of motion that all runs share. Figures of JSON files are of their
+    whole motion.
+    """
+    from hil.runs.comparison import compare
+
+    sources = [*options.runs, *filter(None, [options.reference])]
+    cli.check_outputs(options, inputs=[Path(part) for source in {*sources} for part in source.split(",")])
+    comparison = compare(options.runs, options.reference, options.mechanism)
+    cli.write_json(options.json, comparison.summary())
+    cli.write_report(options, "comparison", comparison)
+    comparison.table().print()
+    for remark in comparison.remarks:
+        print(remark)
+    differing = comparison.differing()
+    print(f"what differs: {', '.join(differing) or 'nothing'}")
+    if "version" not in differing:
+        print(f"all were run by gough {comparison.reference.version}")
 
 
 def _address(text: str) -> tuple[str, int]:

@@ -313,7 +313,8 @@ def end_cycle(
     stage_ns[Stage.LEGS] = ns[CycleStage.SCREENING] + ns[CycleStage.LEGS]
     stage_ns[Stage.PLATFORM] = ns[CycleStage.PLATFORM] + ns[CycleStage.HEADING]
     # From here to `control`, both have the same stages.
-    stage_ns[Stage.POSE.value : Stage.RECORD.value] = ns[CycleStage.POSE.value : CycleStage.END.value]
+    stage_ns[Stage.POSE.value : Stage.RECORD.value] = ns[CycleStage.POSE.value : CycleStage.WATCH.value]
+    stage_ns[Stage.CONTROL] += ns[CycleStage.WATCH]
     stage_ns[Stage.RECORD] = now(timespec) - began
     link[Link.START] = clock[()].start
     record.stage_ns[:] = stage_ns

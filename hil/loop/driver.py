@@ -1,21 +1,23 @@
 """The loop around the cycle: wait for the clock, exchange with the rig, run the cycle, record.
 
-The compiled loop is `run_loop`. The same steps in Python serve rigs and filters that are written in Python.
+The compiled loop is `run_loop`. The same steps in Python serve rigs and stages that are written in Python, and a loop that is
+stepped from outside.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numba.core import event
 from numpy.typing import NDArray
 
-from controller.cycle import CycleStage, run_stages
+from controller.cycle import CycleStage, react, run_stages
 from controller.planning.plan_handover import STREAM_READER
 from controller.safety.causes import Cause, Mode
 from hil.loop.compiled_loop import begin_cycle, end_cycle, exchange_fmu, periods_passed, process_feedback, run_loop
+from hil.loop.own_stages import Cycle, Replacement
 from hil.loop.records import LINK_SIZE, STAGES, WORK, Stage, TargetStream
 from hil.realtime.clock import FREE, new_clock
 from hil.rigs import SILENT, Identity, Rig, new_feedback
@@ -26,17 +28,6 @@ from plant.dynamics.variables import BRAKE
 from plant.fmu.calls import write_drive_mode
 from plant.pose import Array
 from plant.stopwatch import now
-
-
-class PythonFilters(Protocol):
-    """Stages in Python that replace the compiled filters of legs and platform. They change the cycle's state."""
-
-    def step_legs(self, state: Record) -> None:
-        """In place of `controller.estimation.leg_filter.step_leg_filters`."""
-
-    def step_platform(self, state: Record) -> None:
-        """In place of `controller.estimation.platform_filter.step_platform_filter`."""
-
 
 _RAISED = SILENT + 1
 _ENDLESS = np.iinfo(np.int64).max
@@ -60,9 +51,11 @@ class Loop:
     udp: UdpLink | None = None  # replaces the plant
     emulator: UdpEmulator | None = None  # the other side of `udp`, if it is in memory
     stream: Record | None = None  # of a streamed target
-    failure: str = ""  # what a rig in Python has raised
+    failure: str = ""  # what a rig or a stage in Python has raised, in words
+    error: Exception | None = None  # that a stage in Python has raised
 
     def __post_init__(self) -> None:
+        self._failed, self._skips = Cause.NONE.value, False
         self._stream_reader: Record = np.zeros((), STREAM_READER)
         self._work: Record = np.zeros((), WORK)
         self._work["feedback"], self._work["sequence"] = new_feedback(), -1
@@ -73,21 +66,63 @@ class Loop:
         """The position loops of the simulated plant's drives (dtype `POSITION_LOOPS`)."""
         return self._work["loops"][()]
 
-    def run(self, last: int, filters: PythonFilters | None = None) -> int:
-        """Run up to, not including, cycle `last`; returns 0, or the cause if the run has ended on the brakes."""
-        if filters is None:
-            return run_loop(*self._arguments(last, _ENDLESS))
-        return self._run_python(FmuRig(self), last, _ENDLESS, filters)
+    @property
+    def cycle(self) -> Cycle:
+        """What the loop knows, in a view that changes with it."""
+        return Cycle(self.parameters, self.state, self._work["feedback"])
 
-    def follow(self, end: int, rig: Rig | None = None) -> int:
+    def run(self, last: int, replacements: Sequence[Replacement] = ()) -> int:
+        """Run up to, not including, cycle `last`; returns 0, or the cause if the run has ended on the brakes."""
+        if not replacements:
+            return run_loop(*self._arguments(last, _ENDLESS))
+        return self._run_python(FmuRig(self), last, _ENDLESS, replacements)
+
+    def follow(self, end: int, rig: Rig | None = None, replacements: Sequence[Replacement] = ()) -> int:
         """Follow the motion to cycle `end` and stop there, or earlier for a cause; returns the cause."""
         if rig is None:
             return run_loop(*self._arguments(_ENDLESS, end))
         try:
-            return self._run_python(rig, _ENDLESS, end)
+            return self._run_python(rig, _ENDLESS, end, replacements)
         except BaseException:
             stop_quickly(rig)
             raise
+
+    def sense(self, rig: Rig, end: int = _ENDLESS) -> int:
+        """Begin a cycle: wait for its time, and exchange with the rig; returns the cause if the run has ended on the brakes.
+
+        Of a cycle that has begun, `compute` runs stages, and `finish` the rest.
+        """
+        clock, work = self.clock, self._work
+        cause: int = begin_cycle(
+            self.parameters, self.state, clock, self.script, self.link, work, self._streamed(), self.most_missed, end
+        )
+        if cause != Cause.NONE:
+            stop_quickly(rig)
+            return cause
+        began = now(clock["timespec"])
+        status = self._exchange(rig, int(self.state["safety"]["request"]), work["feedback"][()])
+        work["stage_ns"][Stage.SENSE] = now(clock["timespec"]) - began
+        self._failed = process_feedback(self.parameters, self.state, work, status)
+        # After a fault the stages only ramp the commands down.
+        self._skips = self._failed != Cause.NONE or self.state["safety"]["mode"] == Mode.FAULT
+        return cause
+
+    def compute(self, first: CycleStage, last: CycleStage, replacements: Sequence[Replacement] = ()) -> None:
+        """Run the stages from `first` up to, not including, `last`, and the replacements that come before `last`."""
+        for each in replacements:
+            if first <= each.before < last and not self._skips:
+                self._run_stages(first, each.before)
+                self._replace(each)
+                first = each.then
+        self._run_stages(first, last)
+
+    def finish(self, first: CycleStage, replacements: Sequence[Replacement] = ()) -> None:
+        """Run the stages from `first` on, and end the cycle."""
+        self.compute(first, CycleStage.END, replacements)
+        end_cycle(
+            self.parameters, self.state, self.segments, self.records, self.clock, self.script, self.link, self._work,
+            self._streamed(), self._failed,
+        )  # fmt: skip
 
     def memory(self) -> dict[str, Record]:
         """The arrays on which the rest of a run depends, except the plant's."""
@@ -112,6 +147,7 @@ class Loop:
             (now, clock["timespec"]),
             (begin_cycle, *cycle, clock, *shared, self.most_missed, 0),
             (process_feedback, *cycle, work, 0),
+            (react, *cycle, Cause.NONE.value, -1, np.nan, np.nan),
             (run_stages, *cycle, work["feedback"]["measurement"], segments, work["marks"][()], *stages),
             (end_cycle, *cycle, segments, self.records, clock, *shared, 0),
         )
@@ -126,33 +162,30 @@ class Loop:
     def _streamed(self) -> TargetStream | None:
         return None if self.stream is None else TargetStream(self.stream, self._stream_reader)
 
-    def _run_python(self, rig: Rig, last: int, end: int, filters: PythonFilters | None = None) -> int:
-        parameters, state, clock, work, streamed = self.parameters, self.state, self.clock, self._work, self._streamed()
-        feedback, timespec, safety, segments = work["feedback"][()], clock["timespec"], state["safety"], self.segments
-        measurement, marks, cause = feedback["measurement"], work["marks"][()], Cause.NONE.value
-        while cause == Cause.NONE and state["time"]["cycle"] < last:
-            cause = begin_cycle(parameters, state, clock, self.script, self.link, work, streamed, self.most_missed, end)
-            if cause != Cause.NONE:
-                break
-            began = now(timespec)
-            status = self._exchange(rig, int(safety["request"]), feedback)
-            work["stage_ns"][Stage.SENSE] = now(timespec) - began
-            failed = process_feedback(parameters, state, work, status)
-            if not failed:
-                first = CycleStage.SCREENING.value
-                if filters is not None and safety["mode"] != Mode.FAULT:
-                    run_stages(parameters, state, measurement, segments, marks, first, CycleStage.LEGS.value)
-                    t0 = now(timespec)
-                    filters.step_legs(state)
-                    t1 = now(timespec)
-                    filters.step_platform(state)
-                    marks["ns"][CycleStage.LEGS], marks["ns"][CycleStage.PLATFORM] = t1 - t0, now(timespec) - t1
-                    first = CycleStage.HEADING.value
-                failed = run_stages(parameters, state, measurement, segments, marks, first, CycleStage.END.value)
-            end_cycle(parameters, state, segments, self.records, clock, self.script, self.link, work, streamed, failed)
-        if cause != Cause.NONE:
-            stop_quickly(rig)
+    def _run_python(self, rig: Rig, last: int, end: int, replacements: Sequence[Replacement] = ()) -> int:
+        cause = Cause.NONE.value
+        while cause == Cause.NONE and self.state["time"]["cycle"] < last:
+            cause = self.sense(rig, end)
+            if cause == Cause.NONE:
+                self.finish(CycleStage.SCREENING, replacements)
         return cause
+
+    def _run_stages(self, first: CycleStage, last: CycleStage) -> None:
+        if self._failed == Cause.NONE and first < last and (first == CycleStage.SCREENING or not self._skips):
+            measurement, marks = self._work["feedback"]["measurement"], self._work["marks"][()]
+            self._failed = run_stages(
+                self.parameters, self.state, measurement, self.segments, marks, first.value, last.value
+            )  # fmt: skip
+
+    def _replace(self, replacement: Replacement) -> None:
+        timespec = self.clock["timespec"]
+        began = now(timespec)
+        try:
+            replacement.run()
+        except Exception as error:
+            self.failure, self.error = f"{type(error).__name__}: {error}", error
+            react(self.parameters, self.state, Cause.STAGE_FAILED.value, -1, np.nan, np.nan)
+        self._work["marks"]["ns"][replacement.of] += now(timespec) - began
 
     def _exchange(self, rig: Rig, request: int, feedback: Record) -> int:
         try:

@@ -18,10 +18,12 @@ from typing import Any
 
 import viser
 
-from hil.panel.readings import Readings, set_text, status
+from controller.frames import BASE, PLATFORM
+from hil.panel.margins import MARGINS_S, MarginTable
+from hil.panel.readings import Readings, event_list, set_text, status
 from hil.panel.scene import Machine, Scene
 from hil.runs.operator import BEAT_S, Operator, RequestRefusedError
-from hil.runs.operator_messages import ChannelError
+from hil.runs.operator_messages import RUN_ENDED, ChannelError
 from plant.errors import GoughError
 
 HOLD_HZ = 20.0
@@ -58,27 +60,33 @@ class LivePanel:
         self._server, self._address, self._token = server, address, token
         self._watching = Operator(address, token, role="observer", name="gough panel")
         self._run = self._watching.run
+        # What a run before it has left.
+        server.gui.reset()
+        server.scene.reset()
         self.machine = Machine.of_message(self._run["machine"])
         self._scene = Scene(server, self.machine)
         self._orders = _Orders(server, address, token, self._show_operator)
         self._events: deque[str] = deque(maxlen=_EVENTS)
+        self._measured = 0.0
         self._build()
         server.on_client_disconnect(self._orders.leave)
 
-    def run(self, over: threading.Event) -> None:
-        """Show the run until `over` is set; when it has ended, its last state stays."""
+    def run(self, over: threading.Event) -> str:
+        """Show the run until it ends or `over` is set; the picture of its last state stays. Returns how it ended, in words."""
         self._watching.watch()
         while not over.is_set():
             try:
                 self._watching.listen(_LISTEN_S)
+                self._look_at_margins()
             except ChannelError:
-                set_text(self._status, f"{self._status.content}\n\n**The run has ended.**")
                 print("the run has ended; Ctrl-C closes the panel", flush=True)
-                over.wait()
-                return
+                break
             self._take_events()
             if self._watching.telemetry:
                 self._show(self._watching.telemetry)
+        self._take_events()
+        events = event_list([event for event in self._events if event != RUN_ENDED])
+        return f"{self._status.content}\n\n**The run has ended.**\n\n{events}\n\n"
 
     def close(self) -> None:
         """Leave the run."""
@@ -91,28 +99,37 @@ class LivePanel:
         gui = self._server.gui
         gui.configure_theme(control_layout="collapsible", control_width="medium", show_logo=False, show_share_button=False)
         self._status = gui.add_markdown("preparing")
-        self._operating = gui.add_markdown("nobody operates from this panel")
-        self._control = self._button("Take control", lambda client: self._orders.take(client), color="blue")
-        self._button("Stop the motion", self._ordered(lambda operator: operator.stop()), color="orange")
+        gui.add_markdown(f"{self.machine.name} follows {self._run['target']}")
+        if self._run["operated"]:
+            self._operating = gui.add_markdown("nobody operates from this panel")
+            self._control = self._button("Take control", lambda client: self._orders.take(client), color="blue")
+            self._button("Stop the motion", self._ordered(lambda operator: operator.stop()), color="orange")
+            self._button("Pause", self._ordered(lambda operator: operator.pause()))
+            self._button("Go on", self._ordered(lambda operator: operator.resume(wait=False)))
         with gui.add_folder("End the run"):
             self._button("Controlled stop", self._ended(lambda operator: operator.end()), color="orange")
             self._button(
                 "Software quick stop (no emergency stop)", self._ended(lambda operator: operator.emergency()), color="red"
             )
         tabs = gui.add_tab_group()
-        with tabs.add_tab("Jog"):
-            self._build_jog()
-        with tabs.add_tab("Go to"):
-            self._build_moves()
-        with tabs.add_tab("Sliders"):
-            self._build_sliders()
+        if self._run["operated"]:
+            for label, build in (("Jog", self._build_jog), ("Go to", self._build_moves), ("Sliders", self._build_sliders)):
+                with tabs.add_tab(label):
+                    build()
         with tabs.add_tab("Readings"):
             self._readings = Readings(self._server, self.machine, self._scene, self._run["frames"])
+        with tabs.add_tab("Limits"):
+            self._margins = MarginTable(self._server)
+
+    @property
+    def _free(self) -> tuple[int, ...]:
+        """The numbers of the axes along and about which the platform moves."""
+        return (0, 1, 5) if self.machine.planar else tuple(range(len(_AXES)))
 
     def _build_jog(self) -> None:
         gui = self._server.gui
-        axis = gui.add_dropdown("Axis", _AXES)
-        frame = gui.add_dropdown("Along", ("work frame", *self._run["frames"]["names"]))
+        axis = gui.add_dropdown("Axis", tuple(_AXES[number] for number in self._free))
+        frame = gui.add_dropdown("Along", ("work frame", BASE, PLATFORM, *self._run["frames"]["names"]))
         step = gui.add_number("Step [mm, deg]", 1.0, min=0.001, max=100.0, step=0.001)
         speed = gui.add_number("Speed, held [mm/s, deg/s]", 5.0, min=0.01, max=100.0, step=0.01)
 
@@ -154,20 +171,21 @@ class LivePanel:
         self._button("Go to the place", self._ordered(go))
 
     def _build_sliders(self) -> None:
-        """The platform goes where the sliders are; while it moves, the newest place waits."""
+        """The platform follows the sliders."""
         gui = self._server.gui
         gui.add_markdown("The platform follows the sliders, displacements from home, while this browser has control.")
-        sliders = [
-            gui.add_slider(f"{name} [mm]", -_SLIDER_MM, _SLIDER_MM, 0.1, 0.0) for name in _AXES[:3]
-        ] + [gui.add_slider(f"{name} [deg]", -_SLIDER_DEG, _SLIDER_DEG, 0.1, 0.0) for name in _AXES[3:]]  # fmt: skip
+        sliders = {}
+        for number in self._free:
+            most, unit = (_SLIDER_MM, "mm") if number < 3 else (_SLIDER_DEG, "deg")
+            sliders[number] = gui.add_slider(f"{_AXES[number]} [{unit}]", -most, most, 0.1, 0.0)
 
         async def moved(event: Any) -> None:
             if event.client is not None:
-                values = [slider.value for slider in sliders]
+                values = [sliders[number].value if number in sliders else 0.0 for number in range(len(_AXES))]
                 place = {"position": [1e-3 * each for each in values[:3]], "rotation": [radians(each) for each in values[3:]]}
                 self._orders.follow(event.client, place)
 
-        for slider in sliders:
+        for slider in sliders.values():
             slider.on_update(moved)
 
     def _button(self, label: str, do: Callable[[Any], None], color: Any = None) -> Any:
@@ -186,6 +204,12 @@ class LivePanel:
         return lambda client: self._orders.end(client, do)
 
     # ---------------------------------------------------------------------------------------------------------- telemetry
+
+    def _look_at_margins(self) -> None:
+        if time.monotonic() - self._measured > MARGINS_S:
+            self._measured = time.monotonic()
+            with suppress(RequestRefusedError):
+                self._margins.show(self._watching.margins())
 
     def _take_events(self) -> None:
         events = self._watching.events
@@ -247,7 +271,7 @@ class _Orders:
         self._queue.put((client, self._release))
 
     def follow(self, client: Any, place: dict[str, Any]) -> None:
-        """Go to a place, as soon as the platform rests; a newer one takes its turn."""
+        """Go to a place; of those that wait for their turn, the newest counts."""
         self._place = place
         self._queue.put((client, self._follow))
 
@@ -330,15 +354,10 @@ class _Orders:
             self._operator_of(client).stop()
 
     def _follow(self, client: Any) -> None:
-        operator = self._operator_of(client)
-        if self._place is None:
-            return
-        if operator.ask("state")["telemetry"]["moving"]:
-            time.sleep(_LISTEN_S)
-            self._queue.put((client, self._follow))
-            return
-        place, self._place = self._place, None
-        operator.move(place, wait=False)
+        operator, place = self._operator_of(client), self._place
+        self._place = None
+        if place is not None:
+            operator.follow(place)
 
     def _drop(self) -> None:
         with self._lock:

@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 import viser
 
-from hil.panel.scene import COLORINGS, Machine, Scene
+from controller.frames import BASE, PLATFORM, ActiveFrames, parse_frames
+from hil.look import COLORINGS, ESTIMATE, LENGTH, REFERENCE, ROOM, SPEED, TRUTH
+from hil.panel.scene import Machine, Scene
 from hil.runs.operator_messages import pose_in
 from plant.imu_wiring import PLATFORM_IMU
 from plant.pose import Pose, vector_from_rotation
@@ -16,10 +18,11 @@ class Readings:
     """The part of a page with readings, and the choice of what the colours of the legs show."""
 
     def __init__(self, server: viser.ViserServer, machine: Machine, scene: Scene, frames: Mapping[str, Any]) -> None:
-        self._machine, self._frames = machine, frames
+        self._machine, self._choices = machine, frames_to_choose(frames)
         gui = server.gui
         coloring = gui.add_dropdown("Colours of the legs", COLORINGS)
         coloring.on_update(lambda _: setattr(scene, "coloring", coloring.value))
+        self._chosen = gui.add_dropdown("Poses of", tuple(self._choices))
         self._texts = {name: gui.add_markdown("") for name in ("poses", "sure", "legs", "timing")}
         with gui.add_folder("Events"):
             self._texts["events"] = gui.add_markdown("none")
@@ -27,7 +30,7 @@ class Readings:
     def show(self, state: Mapping[str, Any], events: Sequence[str]) -> None:
         """Show a state, and the last events."""
         texts = {
-            "poses": pose_table(state, self._frames),
+            "poses": pose_table(state, self._choices.get(self._chosen.value)),
             "sure": error_line(state),
             "legs": leg_table(state, self._machine),
             "timing": timing_line(state.get("timing", {})),
@@ -51,16 +54,27 @@ def status(state: Mapping[str, Any]) -> str:
     return " · ".join(filter(None, [mode, f"{state.get('time', 0.0):.1f} s", doing, stop]))
 
 
-def pose_table(state: Mapping[str, Any], frames: Mapping[str, Any]) -> str:
-    """Estimate, reference and truth of {2} in {1}, and the tool in the work frame."""
-    named = [("estimate", state.get("pose")), ("reference", state.get("commanded")), ("truth", state.get("truth"))]
-    if state.get("tool") and (frames["work"], frames["tool"]) != ("base", "platform"):
-        named.append((f"{frames['tool']} in {frames['work']}", state["tool"]))
+def frames_to_choose(frames: Mapping[str, Any]) -> dict[str, ActiveFrames | None]:
+    """By its text, each work frame on the base in which the tool's pose can be told, from `frames_message`; the run's own is
+    first, and None stands for {2} in {1}, as the messages have it.
+    """
+    defined = parse_frames(frames["definitions"], "the frames of the run")
+    names = [name for name in (defined.work, BASE, *defined.frames) if defined.root(name) == BASE]
+    pairs = [(name, tool) for name in names for tool in (defined.tool, PLATFORM)]
+    return {
+        f"{tool} in {name}": None if (name, tool) == (BASE, PLATFORM) else defined.active(name, tool) for name, tool in pairs
+    }
+
+
+def pose_table(state: Mapping[str, Any], seen: ActiveFrames | None = None) -> str:
+    """Estimate, reference and truth of a tool in a work frame; None for {2} in {1}."""
+    named = [(ESTIMATE, state.get("pose")), (REFERENCE, state.get("commanded")), (TRUTH, state.get("truth"))]
     rows = [(name, pose_in(pose)) for name, pose in named if pose]
     if not rows:
         return "no pose"
-    text = "| | x | y | z mm | rx | ry | rz deg |\n|---|--:|--:|--:|--:|--:|--:|\n"
-    return text + "".join(f"| {name} | {' | '.join(_pose_cells(pose))} |\n" for name, pose in rows)
+    text = "| | x | y | z [mm] | rx | ry | rz [deg] |\n|---|--:|--:|--:|--:|--:|--:|\n"
+    cells = [(name, _pose_cells(pose if seen is None else seen.read(pose))) for name, pose in rows]
+    return text + "".join(f"| {name} | {' | '.join(numbers)} |\n" for name, numbers in cells)
 
 
 def error_line(state: Mapping[str, Any]) -> str:
@@ -81,7 +95,7 @@ def leg_table(state: Mapping[str, Any], machine: Machine) -> str:
     if "lengths" not in state:
         return ""
     lengths, room, rates = machine.lengths(state), machine.room(state), state["rates"]
-    text = "| leg | length | room mm | speed mm/s | of limit | IMU |\n|--:|--:|--:|--:|--:|:-:|\n"
+    text = f"| leg | {LENGTH} | {ROOM} | {SPEED} | of limit | IMU |\n|--:|--:|--:|--:|--:|:-:|\n"
     for leg in range(machine.legs):
         rate = float(rates[leg])
         used = "used" if leg in state["imus"] else "**out**"

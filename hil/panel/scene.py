@@ -6,16 +6,25 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from hil.look import (
+    BASE_COLOR,
+    COLORINGS,
+    NEUTRAL,
+    PLATFORM_COLOR,
+    REFERENCE_COLOR,
+    TRUTH_COLOR,
+    imu_shares,
+    leg_colors,
+    rgb,
+    ring,
+    room,
+    speed_shares,
+    stroke_shares,
+)  # fmt: skip
 from hil.runs.operator_messages import pose_in
 from plant.pose import Array, Pose, quaternion_from_rotation
 
-COLORINGS = ("stroke", "speed", "IMUs")
-"""What the colours of the legs may show."""
-
-_GOOD, _WARM, _BAD = np.array([[0, 120, 60], [214, 110, 0], [190, 20, 40]], float)
-_BASE, _PLATFORM, _REFERENCE, _TRUTH = (92, 104, 115), (109, 135, 163), (47, 111, 181), (209, 73, 91)
 _LEG_SHARE = 0.025
 """Thickness of a leg, as a share of the radius of the base's joints."""
 
@@ -60,19 +69,15 @@ class Machine:
 
     def room(self, state: Mapping[str, Any]) -> Array:
         """How far each leg (n,) is from the nearer end of its stroke [m]."""
-        lengths = self.lengths(state)
-        room: Array = np.minimum(lengths - self.stroke[:, 0], self.stroke[:, 1] - lengths)
-        return room
+        return room(self.lengths(state), self.stroke)
 
     def shares(self, state: Mapping[str, Any], coloring: str) -> Array:
         """What the colours of the legs (n,) show: 0 is good, and 1 at a limit, or without an IMU."""
         if coloring == "IMUs":
-            return np.array([0.0 if leg in state["imus"] else 1.0 for leg in range(self.legs)])
+            return imu_shares(np.isin(np.arange(self.legs), state["imus"]))
         if coloring == "speed":
-            speeds: Array = np.abs(np.array(state["rates"], float)[: self.legs]) / self.velocity
-            return speeds
-        shares: Array = 1.0 - 2.0 * self.room(state) / np.ptp(self.stroke, axis=1)
-        return shares
+            return speed_shares(np.array(state["rates"], float)[: self.legs], self.velocity)
+        return stroke_shares(self.lengths(state), self.stroke)
 
 
 class Scene:
@@ -86,15 +91,15 @@ class Scene:
         up = machine.up if not machine.planar else np.array([0.0, 0.0, 1.0])
         add.set_up_direction(tuple(up))
         add.add_frame("/base/axes", axes_length=0.3 * radius, axes_radius=0.006 * radius)
-        _plate(server, "/base/plate", machine.base_joints, _BASE, 0.5)
+        _plate(server, "/base/plate", machine.base_joints, BASE_COLOR, 0.5)
         self._platform = add.add_frame("/platform", axes_length=0.25 * radius, axes_radius=0.006 * radius)
-        _plate(server, "/platform/plate", machine.platform_joints, _PLATFORM, 0.7)
+        _plate(server, "/platform/plate", machine.platform_joints, PLATFORM_COLOR, 0.7)
         self._ghosts = {
             name: _outline(server, f"/{name}", machine.platform_joints, color, 0.008 * radius)
-            for name, color in (("commanded", _REFERENCE), ("truth", _TRUTH))
+            for name, color in (("commanded", REFERENCE_COLOR), ("truth", TRUTH_COLOR))
         }
         self._legs = add.add_line_segments(
-            "/legs", np.zeros((machine.legs, 2, 3), np.float32), (90, 90, 90), thickness=_LEG_SHARE * radius
+            "/legs", np.zeros((machine.legs, 2, 3), np.float32), rgb(NEUTRAL), thickness=_LEG_SHARE * radius
         )
         self._labels = [
             add.add_label(f"/label {leg}", str(leg), position=tuple(1.08 * joint))
@@ -139,34 +144,18 @@ def _look(state: Mapping[str, Any], coloring: str) -> tuple[Any, ...]:
     return coloring, [pose is None for pose in poses], state.get("imus"), np.round(numbers, 5).tolist()
 
 
-def leg_colors(shares: Array) -> NDArray[np.uint8]:
-    """Colours (n, 3) from good at 0 over a warning at 0.7 to bad at 1."""
-    shares = np.clip(np.nan_to_num(shares, nan=1.0), 0.0, 1.0)[:, None]
-    warm, hot = np.clip(shares / 0.7, 0.0, 1.0), np.clip((shares - 0.7) / 0.3, 0.0, 1.0)
-    colors: NDArray[np.uint8] = np.round(_GOOD + warm * (_WARM - _GOOD) + hot * (_BAD - _WARM)).astype(np.uint8)
-    return colors
-
-
 def _place(handle: Any, pose: Pose) -> None:
     handle.position, handle.wxyz = tuple(pose.position), tuple(quaternion_from_rotation(pose.rotation))
 
 
-def _rim(joints: Array) -> Array:
-    """The joints (n, 3) in their order round the centre."""
-    centered = joints - joints.mean(axis=0)
-    plane = np.linalg.svd(centered)[2][:2]
-    x, y = plane @ centered.T
-    return joints[np.argsort(np.arctan2(y, x))]
-
-
-def _plate(server: viser.ViserServer, name: str, joints: Array, color: tuple[int, int, int], opacity: float) -> None:
-    rim = _rim(joints)
+def _plate(server: viser.ViserServer, name: str, joints: Array, color: str, opacity: float) -> None:
+    rim = joints[ring(joints)[:-1]]
     fan = np.arange(1, len(rim) - 1)
     faces = np.stack([np.zeros_like(fan), fan, fan + 1], axis=1)
-    server.scene.add_mesh_simple(name, rim, faces, color=color, opacity=opacity, flat_shading=True, side="double")
+    server.scene.add_mesh_simple(name, rim, faces, color=rgb(color), opacity=opacity, flat_shading=True, side="double")
 
 
-def _outline(server: viser.ViserServer, name: str, joints: Array, color: tuple[int, int, int], thickness: float) -> Any:
-    rim = _rim(joints)
-    edges = np.stack([rim, np.roll(rim, -1, axis=0)], axis=1).astype(np.float32)
-    return server.scene.add_line_segments(name, edges, color, thickness=thickness)
+def _outline(server: viser.ViserServer, name: str, joints: Array, color: str, thickness: float) -> Any:
+    rim = joints[ring(joints)]
+    edges = np.stack([rim[:-1], rim[1:]], axis=1).astype(np.float32)
+    return server.scene.add_line_segments(name, edges, rgb(color), thickness=thickness)

@@ -91,6 +91,11 @@ def replay(paths: Sequence[Path | str]) -> Replay:
             f"{first.path} was recorded by gough {first.version}, whose cycle has other parameters than that of this gough "
             f"{version('gough')}: replay it with the version that recorded it; everything else reads it as it is"
         )
+    if own := first.config.get("stages"):
+        raise RecordingError(
+            f"{first.path} is of a run with stages of its own, {', '.join(own)}: nothing can replay what they computed; "
+            "everything else reads it as it is"
+        )
     broken = _broken(parameters, segments, records)
     if broken is not None:
         raise RecordingError(f"{first.path} cannot be replayed, as {broken}: it was forged or is damaged")

@@ -11,15 +11,16 @@ from plotly.subplots import make_subplots
 
 from hil.calibration.assessment import STAGES, weak_words
 from hil.calibration.procedure import RigCalibration
+from hil.look import AXIS_NAMES, COLORS, FAINT, NEUTRAL, SERIES
 from hil.reports import view
 from hil.reports.calibration_picture import KINDS, accuracy_svg
-from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEGEND, figure_html, overview, place, write_page
+from hil.reports.page import LAYOUT, LEGEND, figure_html, overview, place, write_page
 from hil.table import Cell, Table
 from plant.dynamics.variables import IMU_COUNT
 from plant.imu import MILLI_G
 
 _IMU_NAMES = [f"{imu}" for imu in range(IMU_COUNT)]
-_STAGE_COLORS = {"before": FAINT, "known": "#e8871e", "rests": "#3b6fb6", "motion": "#3a9d6e"}
+_STAGE_COLORS = {"before": FAINT, "known": SERIES[1], "rests": SERIES[0], "motion": SERIES[2]}
 
 _CONSTANTS = {
     "gyroscope bias": ("deg/s", np.degrees(1.0)),
@@ -128,7 +129,7 @@ def _constants(summary: Mapping[str, Any]) -> go.Figure:
                 hovertemplate=f"{shown}: %{{y:.4~g}} ± %{{customdata:.2~g}} {unit}<extra></extra>",
                 **place(number, columns),
             )
-        figure.update_yaxes(title_text=f"{name} [{unit}]", zerolinecolor=INK, **place(number, columns))
+        figure.update_yaxes(title_text=f"{name} [{unit}]", zerolinecolor=NEUTRAL, **place(number, columns))
     figure.update_xaxes(tickvals=list(range(IMU_COUNT)), title_text="IMU", title_standoff=2)
     return figure.update_layout(LAYOUT, height=60 + 230 * rows, legend=LEGEND)
 
@@ -140,7 +141,7 @@ def _rests(result: RigCalibration) -> go.Figure:
         mode="markers+text",
         text=[str(n) for n in range(len(positions))],
         marker={"size": 4, "color": COLORS["z"]},
-        textfont={"size": 10, "color": INK},
+        textfont={"size": 10, "color": NEUTRAL},
         hovertemplate="rest %{text}: %{x:.1f}, %{y:.1f}, %{z:.1f} mm<extra></extra>",
     )
     figure = go.Figure([view.line(positions, FAINT, 2), rests])

@@ -6,16 +6,17 @@ from pathlib import Path
 from typing import Any
 
 from hil.calibration.assessment import STAGES
+from hil.look import FAINT, GRID, SERIES
+from hil.reports import svg
 from plant.files import write_whole
 
 KINDS = {
-    "predicted": ("predicted", "#9aa5b1"),
-    "validated": ("halves of the data differ by", "#e8871e"),
-    "true": ("true", "#3b6fb6"),
+    "predicted": ("predicted", FAINT),
+    "validated": ("halves of the data differ by", SERIES[1]),
+    "true": ("true", SERIES[0]),
 }
 """Measures of accuracy in a summary, with their names and colors."""
 
-_INK, _LINE = "#26323d", "#dfe4e9"
 _LEFT, _TOP, _BAR, _GAP, _WIDTH = 150, 40, 14, 16, 500
 
 
@@ -45,25 +46,18 @@ def accuracy_svg(summary: Mapping[str, Any], error: str, unit: str, scale: float
     parts = []
     for decade in range(first, last + 1):
         at = x(10.0**decade)
-        parts.append(f'<path d="M{at:.1f} {_TOP - 6}V{bottom}" stroke="{_LINE}"/>')
-        parts.append(_text(at, bottom + 18, f"{10.0**decade:g} {unit}", "middle"))
+        parts.append(f'<path d="M{at:.1f} {_TOP - 6}V{bottom}" stroke="{GRID}"/>')
+        parts.append(svg.text(at, bottom + 18, f"{10.0**decade:g} {unit}", "middle"))
     for i, stage in enumerate(stages):
-        parts.append(_text(_LEFT - 10, _TOP + i * step + 1.5 * _BAR + 4, STAGES[stage], "end"))
+        parts.append(svg.text(_LEFT - 10, _TOP + i * step + 1.5 * _BAR + 4, STAGES[stage], "end"))
         for j, (kind, (_, color)) in enumerate(KINDS.items()):
             if (size := sizes.get((stage, kind))) is None:
                 continue
             y, end = _TOP + i * step + j * _BAR, x(size)
             parts.append(f'<path d="M{_LEFT} {y}H{end:.1f}V{y + _BAR - 2}H{_LEFT}Z" fill="{color}"/>')
-            parts.append(_text(end + 5, y + _BAR - 3, f"{size:.3g}", "start"))
+            parts.append(svg.text(end + 5, y + _BAR - 3, f"{size:.3g}", "start"))
     for j, (name, color) in enumerate(KINDS.values()):
         at = _LEFT + 130 * j + 70 * (j > 1)
         parts.append(f'<path d="M{at} 8h12v12h-12Z" fill="{color}"/>')
-        parts.append(_text(at + 17, 18, name, "start"))
-    size = f"{_LEFT + _WIDTH + 60} {bottom + 30}"
-    style = f'font-family="system-ui, sans-serif" font-size="12" fill="{_INK}"'
-    body = "\n".join(parts)
-    return f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {size}" {style}>\n{body}\n</svg>'
-
-
-def _text(x: float, y: float, text: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{text}</text>'
+        parts.append(svg.text(at + 17, 18, name, "start"))
+    return svg.document(_LEFT + _WIDTH + 60, bottom + 30, parts)

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 
+from hil.look import COLORS, LEG_NAMES, NEUTRAL, ring
 from hil.reports import view
-from hil.reports.page import COLORS, INK, LAYOUT, LEG_NAMES, figure_html, overview, write_page
+from hil.reports.page import LAYOUT, figure_html, overview, write_page
 from hil.studies.classification import PAPER, Description, Need, joints_about, planar_home
 from hil.table import Cell, Table
 from plant.mechanism import Mechanism
@@ -67,7 +68,7 @@ def _graph(description: Description) -> go.Figure:
         )  # fmt: skip
     for x, y, name in ((base, 0.0, "base joint"), (platform, 1.0, "platform joint")):
         figure.add_scatter(
-            x=x, y=np.full(len(x), y), mode="markers", showlegend=False, marker={"size": 15, "color": INK},
+            x=x, y=np.full(len(x), y), mode="markers", showlegend=False, marker={"size": 15, "color": NEUTRAL},
             hovertemplate=f"{name} %{{pointNumber}}<extra></extra>",
         )  # fmt: skip
     hidden = {"visible": False, "fixedrange": True}
@@ -84,9 +85,9 @@ def _spatial_view(mechanism: Mechanism) -> go.Figure:
     texts = [", ".join(map(str, legs)) for legs in shared]
     figure = go.Figure(
         [
-            *view.plate(joints[view.ring(joints)], *view.PLATFORM),
+            *view.plate(joints[ring(joints)], *view.PLATFORM),
             view.line(view.segments(base, joints), view.segment_colors(LEG_NAMES), 10),
-            *view.plate(base[view.ring(base)], *view.BASE),
+            *view.plate(base[ring(base)], *view.BASE),
             view.labels(labels, texts),
         ]
     )

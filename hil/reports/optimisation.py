@@ -11,13 +11,14 @@ import optuna
 import plotly.graph_objects as go
 from optuna import visualization
 
-from hil.reports.page import INK, LAYOUT, LEGEND, figure_html, overview, write_page
+from hil.look import BAD, NEUTRAL
+from hil.reports.page import LAYOUT, LEGEND, figure_html, overview, write_page
 from hil.sweep.design import Design
 from hil.sweep.optimisation import RUN, OptimisationResult, Trial, quiet
 from hil.sweep.trials import Comparison
 from hil.table import Cell, Table
 
-_CHOSEN, _START = "#c02f3f", INK
+_CHOSEN, _START = BAD, NEUTRAL
 
 
 def write_report(result: OptimisationResult, chosen: Trial, comparisons: Sequence[Comparison], path: Path) -> None:

@@ -8,18 +8,8 @@ import plotly.graph_objects as go
 from plotly.io import to_html
 from plotly.offline import get_plotlyjs
 
+from hil.look import BAD, DARK, FAINT, FONT, GOOD, GRID, LIGHT, NEUTRAL, SERIES
 from plant.files import write_whole
-from plant.mechanism import LEGS
-
-AXIS_NAMES = ("x", "y", "z")
-LEG_NAMES = tuple(f"leg {k}" for k in range(LEGS))
-COLORS = {
-    **dict(zip(AXIS_NAMES, ("#d1495b", "#2a9d5c", "#2f6fb5"), strict=True)),
-    **dict(zip(LEG_NAMES, ("#3b6fb6", "#e8871e", "#3a9d6e", "#c8403f", "#8a5fb0", "#3fa7b8"), strict=True)),
-    "error": "#d1495b",
-    "level": "#26323d",
-}
-INK, FAINT = "#26323d", "#9aa5b1"
 
 
 def write_page(path: Path, title: str, subtitle: str, body: str, script: str = "") -> None:
@@ -36,6 +26,7 @@ def write_page(path: Path, title: str, subtitle: str, body: str, script: str = "
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
 <title>{title}</title>
 <style>{_STYLE}</style>
 <script>{get_plotlyjs()}</script>
@@ -75,19 +66,31 @@ def figure_html(name: str, title: str, caption: str, figure: go.Figure | str, ki
     return f'<figure class="{kind}">{text}</figure>\n'
 
 
+_AXIS = {"gridcolor": GRID, "zerolinecolor": GRID, "zerolinewidth": 2, "automargin": True}
 LAYOUT: dict[str, Any] = {
-    "template": "plotly_white",
-    "font": {"family": "system-ui, -apple-system, 'Segoe UI', 'Liberation Sans', sans-serif", "size": 12, "color": INK},
+    "template": go.layout.Template(layout={"xaxis": _AXIS, "yaxis": _AXIS, "colorway": SERIES}),
+    "font": {"family": FONT, "size": 12, "color": NEUTRAL},
     "margin": {"l": 70, "r": 15, "t": 30, "b": 45},
+    "paper_bgcolor": "rgba(0, 0, 0, 0)",
+    "plot_bgcolor": "rgba(0, 0, 0, 0)",
+    "modebar": {"bgcolor": "rgba(0, 0, 0, 0)", "color": FAINT, "activecolor": NEUTRAL},
 }
 LEGEND = {"orientation": "h", "x": 0.0, "y": 1.0, "yanchor": "bottom"}
-"""The look of all figures, and of a legend above a plot."""
+"""The look of all figures, on light and on dark pages, and of a legend above a plot."""
 
-_STYLE = """
-:root { --ink: #26323d; --faint: #66727e; --line: #dfe4e9; --accent: #2f6fb5; }
+
+def _properties(colors: dict[str, str]) -> str:
+    return " ".join(f"--{name}: {color};" for name, color in colors.items())
+
+
+_STYLE = f"""
+:root {{ color-scheme: light dark; --good: {GOOD}; --bad: {BAD}; {_properties(LIGHT)} }}
+@media (prefers-color-scheme: dark) {{ :root {{ {_properties(DARK)} }} }}
+body {{ font: 15px/1.45 {FONT}; }}
+"""
+_STYLE += """
 * { box-sizing: border-box; }
-body { margin: 0 auto; padding: 28px 24px 48px; max-width: 1240px; color: var(--ink); background: #fff;
-  font: 15px/1.45 system-ui, -apple-system, "Segoe UI", "Liberation Sans", sans-serif; }
+body { margin: 0 auto; padding: 28px 24px 48px; max-width: 1240px; color: var(--ink); background: var(--ground); }
 header { border-bottom: 2px solid var(--accent); padding-bottom: 12px; margin-bottom: 20px; }
 h1 { font-size: 26px; font-weight: 600; margin: 0; overflow-wrap: anywhere; }
 header p { margin: 4px 0 0; color: var(--faint); overflow-wrap: anywhere; }
@@ -103,14 +106,17 @@ td { text-align: right; padding: 8px 0 8px 10px; }
 dl { display: grid; gap: 10px; margin: 22px 0 0; }
 dl div { border-left: 3px solid var(--line); padding-left: 12px; }
 dd { margin: 0; font-size: 22px; font-variant-numeric: tabular-nums; }
-dd.good { color: #23864c; }
-dd.bad { color: #c02f3f; }
+dd.good { color: var(--good); }
+dd.bad { color: var(--bad); }
 dt { color: var(--faint); font-size: 13px; }
 figure { margin: 0; min-width: 0; }
 figure.time { margin-top: 32px; border-top: 1px solid var(--line); padding-top: 18px; }
 .pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(420px, 100%), 1fr)); gap: 28px; }
 table + figure { margin-top: 22px; }
 figcaption { color: var(--faint); font-size: 13px; }
+.js-plotly-plot :is([class$="tick"] text, [class$="title"], .legendtext) { fill: var(--faint) !important; }
+.js-plotly-plot .updatemenu-item-rect { fill: var(--ground) !important; stroke: var(--line) !important; }
+.js-plotly-plot .updatemenu-item-text { fill: var(--ink) !important; }
 @media (max-width: 960px) { .overview { grid-template-columns: minmax(0, 1fr); } }
 @media (max-width: 600px) { body { padding: 16px 12px 32px; } table { display: block; overflow-x: auto; } }
 """

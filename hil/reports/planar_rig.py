@@ -8,6 +8,7 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
+from hil.look import BAND, SERIES
 from hil.reports.page import LAYOUT, LEGEND, figure_html, place, write_page
 from hil.reports.view import segments
 from hil.studies.planar_rig import COMPONENTS, SOURCES, TRUE_ANGLE, TRUE_DISTANCE_M, RigEvaluation, modes_near
@@ -15,7 +16,7 @@ from hil.table import Table
 from plant.mechanism.planar import PlanarMechanism
 from plant.pose import Array
 
-_COLORS = dict(zip(SOURCES, ("#e8871e", "#3b6fb6", "#3a9d6e"), strict=True))
+_COLORS = dict(zip(SOURCES, (SERIES[1], SERIES[0], SERIES[2]), strict=True))
 _DRAWN = SOURCES.index("kalman")
 _COLUMNS_DRAWN = 4
 
@@ -103,9 +104,9 @@ def _mode_plot(result: RigEvaluation) -> go.Figure:
     )
     for number, (pose, near, far) in enumerate(drawn):
         for name, position, angle, line in (
-            ("true pose", pose.true_pose[:2], pose.true_pose[2], {"color": "#c5ccd4", "width": 7}),
-            ("mode nearest to it", near.position, near.angle, {"color": "#3b6fb6", "width": 2}),
-            ("other mode", far.position, far.angle, {"color": "#e8871e", "width": 2, "dash": "dot"}),
+            ("true pose", pose.true_pose[:2], pose.true_pose[2], {"color": BAND, "width": 7}),
+            ("mode nearest to it", near.position, near.angle, {"color": SERIES[0], "width": 2}),
+            ("other mode", far.position, far.angle, {"color": SERIES[1], "width": 2, "dash": "dot"}),
         ):
             x, y = 1e3 * _outline(result.mechanism, position, angle).T
             figure.add_scatter(

@@ -11,8 +11,27 @@ from numpy.typing import NDArray
 from plotly.subplots import make_subplots
 
 from controller.frames import BASE, Frames, compose
+from hil.look import (
+    AXIS_NAMES,
+    BAND,
+    COLORINGS,
+    COLORS,
+    FAINT,
+    GRID,
+    LEG_NAMES,
+    NEUTRAL,
+    REFERENCE,
+    REFERENCE_COLOR,
+    TRUTH,
+    TRUTH_COLOR,
+    imu_shares,
+    ring,
+    speed_shares,
+    stroke_shares,
+)  # fmt: skip
 from hil.reports import view
-from hil.reports.page import AXIS_NAMES, COLORS, FAINT, INK, LAYOUT, LEG_NAMES, LEGEND, figure_html, overview, place, write_page
+from hil.reports.curves import curve
+from hil.reports.page import LAYOUT, LEGEND, figure_html, overview, place, write_page
 from hil.runs.simulation import SimulationResult
 from hil.table import Cell, Table
 from plant.imu_wiring import ALL_IMUS
@@ -20,7 +39,7 @@ from plant.pose import Array, Pose, pose_errors, vector_from_rotation
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 
 _QUANTITIES = (("position", "mm", 1e3), ("rotation", "deg", np.degrees(1.0)))
-_POINTS, _PATH_POINTS = 3000, 600
+_PATH_POINTS = 600
 _FRAMES, _FRAME_RATE_HZ, _SLOWEST_HZ = 150, 25.0, 15.0
 _TUBE = 0.62
 """The drawn length of a leg's lower part, as a share of the leg's least length."""
@@ -52,6 +71,13 @@ def write_report(result: SimulationResult, path: Path) -> None:
         body += _frames_section(result.frames.frames)
     title = f"gough: {result.mechanism.name} follows {result.target.name}"
     write_page(path, title, _configuration(result, summary), body, _SHARED_TIME)
+
+
+def figures(result: SimulationResult) -> dict[str, go.Figure]:
+    """The report's figures, for a notebook: `mechanism`, which moves, `pose`, `errors`, `lengths`, `motion`, `drives`, and
+    `protection` where there is a protection level.
+    """
+    return {"mechanism": _mechanism_view(result)[1]} | {name: figure for name, _, _, figure in _time_figures(result)}
 
 
 def _configuration(result: SimulationResult, summary: dict[str, Any]) -> str:
@@ -118,7 +144,7 @@ def _facts(summary: dict[str, Any]) -> str:
     facts = (
         ("violations of limits by the reference", f"{violations}", "good" if violations == 0 else "bad"),
         ("real-time factor", f"{summary['real_time_factor']:.1f}", ""),
-        ("cycle [µs], p50 / p99 / p99.9", " / ".join(f"{cycle[name]:.1f}" for name in ("p50", "p99", "p999")), ""),
+        ("cycle [us], p50 / p99 / p99.9", " / ".join(f"{cycle[name]:.1f}" for name in ("p50", "p99", "p999")), ""),
     )
     items = "".join(f'<div><dd class="{kind}">{value}</dd><dt>{name}</dt></div>' for name, value, kind in facts)
     return f"<dl>{items}</dl>"
@@ -251,13 +277,13 @@ def _plot(times: Array, panels: Sequence[_Panel], columns: int = 1, shared_yaxes
         peers = panels[first : first + columns] if shared_yaxes else [panel]
         unit = panel.label.partition("[")[2].rstrip("]")
         for name, values in zip(panel.names, panel.planned.T if panel.planned is not None else (), strict=False):
-            line = {"color": "#c5ccd4", "width": 5}
-            figure.add_scatter(**_curve(times, values, f"{name} planned", unit), line=line, **legend("planned"), **at)
+            line = {"color": BAND, "width": 5}
+            figure.add_scatter(**curve(times, values, f"{name} planned", unit), line=line, **legend("planned"), **at)
         for name, values in zip(panel.names, panel.values.T, strict=True):
             line = {"color": COLORS[name], "width": 1.5}
-            figure.add_scatter(**_curve(times, values, name, unit), line=line, **legend(name), **at)
+            figure.add_scatter(**curve(times, values, name, unit), line=line, **legend(name), **at)
         for limit in panel.limits:
-            figure.add_hline(limit, line={"color": INK, "width": 1, "dash": "dash"}, **legend("limit"), **at)
+            figure.add_hline(limit, line={"color": NEUTRAL, "width": 1, "dash": "dash"}, **legend("limit"), **at)
         figure.update_yaxes(title_text=panel.label, range=_span(peers, times >= 0.0), **at)
     if times[0] < 0.0:
         figure.add_vrect(times[0], min(0.0, times[-1]), fillcolor=FAINT, opacity=0.2, line_width=0, layer="below")
@@ -277,27 +303,6 @@ def _span(panels: Sequence[_Panel], moving: NDArray[np.bool_]) -> tuple[float, f
     return float(least - margin), float(greatest + margin)
 
 
-def _curve(times: Array, values: Array, name: str, unit: str) -> dict[str, Any]:
-    kept = _extremes(values)
-    return {
-        "x": times[kept].astype(np.float32),
-        "y": values[kept].astype(np.float32),
-        "mode": "lines",
-        "hovertemplate": f"{name}: %{{y:.4~g}} {unit} at %{{x:.3f}} s<extra></extra>",
-    }
-
-
-def _extremes(values: Array, points: int = _POINTS) -> NDArray[np.intp]:
-    """Indices of about `points` samples of `values` (N,), with the least and the greatest of each bucket."""
-    if len(values) <= points:
-        return np.arange(len(values))
-    size = -(-2 * len(values) // points)
-    buckets = values[: len(values) // size * size].reshape(-1, size)
-    starts = np.arange(0, buckets.size, size)
-    rest = np.arange(buckets.size, len(values))
-    return np.unique(np.concatenate([starts + buckets.argmin(axis=1), starts + buckets.argmax(axis=1), rest]))
-
-
 def _differences(poses: Sequence[Array], origins: Sequence[Array]) -> Array:
     """Translations [mm] and rotation vectors [deg] (N, 6) from the poses `origins` to `poses`, in {1}."""
     errors: Array = pose_errors(*poses, *origins) * np.repeat([1e3, np.degrees(1.0)], 3)
@@ -306,47 +311,59 @@ def _differences(poses: Sequence[Array], origins: Sequence[Array]) -> Array:
 
 def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
     """The caption and the figure of the moving mechanism."""
-    mechanism = result.mechanism
+    mechanism, records = result.mechanism, result.records
     moving = np.flatnonzero(result.times >= 0.0)
     span = len(moving) / result.config.rate
     count = int(np.clip(span * _FRAME_RATE_HZ, 1, _FRAMES))
     frame_s = min(span / count, 1.0 / _SLOWEST_HZ)
     shown = moving[np.linspace(0, len(moving) - 1, count).astype(int)]
-    real, all_positions, all_rotations = _drawn_poses(result)
-    positions, rotations = 1e3 * all_positions[shown], all_rotations[shown]
-    tool = Pose(all_positions, all_rotations)
+    tool = Pose(records["position"], records["rotation"])
     if result.frames is not None:
         tool = compose(tool, result.frames.tool)
     path = 1e3 * tool.position[moving[:: -(-len(moving) // _PATH_POINTS)]]
     tips, tip_axes = 1e3 * tool.position[shown], tool.rotation[shown]
     base, platform = 1e3 * mechanism.base_joints, 1e3 * mechanism.platform_joints
-    joints = positions[:, None] + platform @ np.swapaxes(rotations, 1, 2)
-    platform_ring = view.ring(platform)
+    ghosts = {REFERENCE_COLOR: (result.reference_positions, result.reference_rotations)}
+    if result.truth_known:
+        ghosts[TRUTH_COLOR] = (result.true_positions, result.true_rotations)
+
+    def joints_at(positions: Array, rotations: Array) -> Array:
+        """The platform's joints (count, n, 3) [mm] at poses (N)."""
+        joints: Array = 1e3 * positions[shown, None] + platform @ np.swapaxes(rotations[shown], 1, 2)
+        return joints
+
+    joints = joints_at(records["position"], records["rotation"])
+    platform_ring = ring(platform)
+    rims = [joints_at(*poses)[:, platform_ring] for poses in ghosts.values()]
+    shares = _leg_shares(result, shown, 1e-3 * np.linalg.norm(joints - base, axis=2))
     numbers = base + 0.12 * (base - base.mean(axis=0))
     tube = _TUBE * 1e3 * mechanism.require_limits().stroke[:, :1]
     triad = 0.4 * np.linalg.norm(platform, axis=1).max()
 
-    def moving_parts(k: int) -> list[Array]:
-        """The platform's rim, tubes, rods and axes."""
+    def moving_parts(k: int) -> list[Any]:
+        """The traces of what moves: the platform, tubes by the first colouring, rods, axes, ghosts, other tubes."""
         legs = joints[k] - base
         ends = base + tube * legs / np.linalg.norm(legs, axis=1, keepdims=True)
+        tubes = [view.shaded_line(view.segments(base, ends), np.repeat(each[k], 3), 14) for each in shares.values()]
         axes = view.segments(np.broadcast_to(tips[k], (3, 3)), tips[k] + triad * tip_axes[k].T)
-        return [joints[k][platform_ring], view.segments(base, ends), view.segments(ends, joints[k]), axes]
+        return [
+            *view.plate(joints[k][platform_ring], *view.PLATFORM),
+            tubes[0],
+            view.line(view.segments(ends, joints[k]), NEUTRAL, 6),
+            view.line(axes, view.segment_colors(AXIS_NAMES), 5),
+            *(view.line(rim[k], color, 3) for rim, color in zip(rims, ghosts, strict=True)),
+            *(each.update(visible=False) for each in tubes[1:]),
+        ]
 
     def frame(k: int) -> go.Frame:
-        lines = moving_parts(k)
-        plate = {"type": "mesh3d", **view.coordinates(lines[0][:-1])}
-        data = [plate, *({"type": "scatter3d", **view.coordinates(line)} for line in lines)]
+        data = [_moved(part) for part in moving_parts(k)]
         return go.Frame(name=str(k), traces=list(range(len(data))), data=data)
 
-    rim, tubes, rods, axes = moving_parts(0)
+    first = moving_parts(0)
     figure = go.Figure(
         [
-            *view.plate(rim, *view.PLATFORM),
-            view.line(tubes, view.segment_colors(LEG_NAMES[: mechanism.legs]), 14),
-            view.line(rods, "#6b7683", 6),
-            view.line(axes, view.segment_colors(AXIS_NAMES), 5),
-            *view.plate(base[view.ring(base)], *view.BASE),
+            *first,
+            *view.plate(base[ring(base)], *view.BASE),
             view.line(path, FAINT, 2),
             view.labels(numbers, [str(k) for k in range(mechanism.legs)]),
         ],
@@ -358,19 +375,54 @@ def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
         origin, ends = 1e3 * work.position, 1e3 * work.position + triad * work.rotation.T
         figure.add_trace(view.line(view.segments(np.broadcast_to(origin, (3, 3)), ends), view.segment_colors(AXIS_NAMES), 5))
         points = np.concatenate([points, origin[None], ends])
+    player = _player(result.times[shown], frame_s)
+    player["updatemenus"].append(_colorings([2, *range(len(first) - len(COLORINGS) + 1, len(first))]))
     figure.update_layout(
         LAYOUT,
         **view.VIEW,
         height=540,
         uirevision="kept",
         scene=view.scene(points, mechanism.up_in_base, np.array([0.0, 0.0, 1.0]) if mechanism.planar else None),
-        **_player(result.times[shown], frame_s),
+        **player,
     )
     speed = span / count / frame_s
     pace = "in real time" if speed < 1.05 else f"at {speed:.2g} times real speed"
     pace += ", or as fast as the browser draws them"
     of = "the origin" if result.frames is None else result.frames.frames.tool
-    return f"{real} poses {pace}; the path of {of} in grey. Drag to turn, scroll to zoom.", figure
+    truth = f", a red one of the {TRUTH}" if result.truth_known else ""
+    caption = (
+        f"Estimated poses {pace}, with a blue ghost of the {REFERENCE}{truth}, and the path of {of} in grey. Legs turn from "
+        "green to red near an end of the stroke, near the greatest speed, or without an IMU. Drag to turn, scroll to zoom."
+    )
+    return caption, figure
+
+
+def _moved(part: Any) -> dict[str, Any]:
+    """What a frame changes of a trace."""
+    moved = {"type": part.type, **{axis: part[axis] for axis in AXIS_NAMES}}
+    if part.type == "scatter3d" and part.line.colorscale is not None:
+        moved["line"] = {"color": part.line.color}
+    return moved
+
+
+def _leg_shares(result: SimulationResult, shown: NDArray[np.intp], lengths: Array) -> dict[str, Array]:
+    """What each of `COLORINGS` shows of legs with these lengths (count, n) [m], at the records `shown` (count,)."""
+    limits, records, legs = result.mechanism.require_limits(), result.records[shown], np.arange(result.mechanism.legs)
+    shares = (
+        stroke_shares(lengths, limits.stroke),
+        speed_shares(records["reference"][:, legs, 1], limits.velocity),
+        imu_shares((records["imus"][:, None] >> legs & 1).astype(np.bool_)),
+    )
+    return dict(zip(COLORINGS, shares, strict=True))
+
+
+def _colorings(tubes: Sequence[int]) -> dict[str, Any]:
+    """A menu that chooses which of the traces `tubes`, and so which colouring, is seen."""
+    buttons = [
+        {"label": f"legs by {name}", "method": "restyle", "args": [{"visible": [tube == own for tube in tubes]}, [*tubes]]}
+        for name, own in zip(COLORINGS, tubes, strict=True)
+    ]
+    return {"buttons": buttons, "x": 0.0, "xanchor": "left", "y": 1.0, "yanchor": "top", "pad": {"t": 8, "l": 10}}
 
 
 def _player(times: Array, frame_s: float) -> dict[str, Any]:
@@ -387,10 +439,13 @@ def _player(times: Array, frame_s: float) -> dict[str, Any]:
         "len": 0.8,
         "y": 0.0,
         "pad": {"t": 10},
+        "bgcolor": GRID,
+        "activebgcolor": FAINT,
+        "bordercolor": FAINT,
         "ticklen": 0,
         "minorticklen": 0,
-        "font": {"color": "rgba(0,0,0,0)", "size": 1},
-        "currentvalue": {"prefix": "time ", "suffix": " s", "xanchor": "right", "font": {"color": INK, "size": 13}},
+        "font": {"color": "rgba(0, 0, 0, 0)", "size": 1},
+        "currentvalue": {"prefix": "time ", "suffix": " s", "xanchor": "right", "font": {"color": NEUTRAL, "size": 13}},
         "steps": steps,
     }
     menu = {

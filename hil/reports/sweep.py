@@ -14,7 +14,8 @@ from plotly.colors import sample_colorscale
 from plotly.subplots import make_subplots
 
 from hil.engine.batches import fingerprint
-from hil.reports.page import COLORS, FAINT, INK, LAYOUT, LEG_NAMES, LEGEND, figure_html, overview, place, write_page
+from hil.look import COLORS, FAINT, NEUTRAL, SERIES
+from hil.reports.page import LAYOUT, LEGEND, figure_html, overview, place, write_page
 from hil.runs.config import SimulationConfig
 from hil.sweep.analysis import INTERACTIONS, Interval, Level, Sensitivity
 from hil.sweep.store import REASON, STATUS, as_stored
@@ -28,7 +29,6 @@ _POINTS, _CURVE_POINTS = 400, 300
 """The most points of a panel, and of the curve of a distribution."""
 _LOGARITHMIC = 20.0
 """An axis is logarithmic if the 99 % quantile is so many times the 1 % quantile."""
-_PALETTE = [COLORS[name] for name in LEG_NAMES]
 
 
 class _Shown(NamedTuple):
@@ -284,7 +284,7 @@ def _medians(levels: Sequence[Level], shown: _Shown, factor: Factor, scale: floa
 def _shares(shares: dict[str, dict[str, float]]) -> go.Figure:
     figure = go.Figure()
     names = list(dict.fromkeys(name for found in shares.values() for name in found))
-    colors = [FAINT if name == INTERACTIONS else _PALETTE[i % len(_PALETTE)] for i, name in enumerate(names)]
+    colors = [FAINT if name == INTERACTIONS else SERIES[i % len(SERIES)] for i, name in enumerate(names)]
     for name, color in zip(names, colors, strict=True):
         parts = [100.0 * found.get(name, 0.0) for found in shares.values()]
         figure.add_bar(
@@ -328,7 +328,7 @@ def _index_bars(cells: dict[str, list[Sensitivity]]) -> go.Figure:
             figure.add_bar(
                 y=[each.factor for each in found], x=[each.value for each in indices], name=label, legendgroup=label,
                 showlegend=number == 0, orientation="h", marker_color=color,
-                error_x={"array": [each.high - each.value for each in indices], "thickness": 1.4, "width": 4, "color": INK},
+                error_x={"array": [each.high - each.value for each in indices], "thickness": 1.4, "width": 4, "color": NEUTRAL},
                 hovertemplate=f"%{{y}}: {label} %{{x:.3f}} ± %{{error_x.array:.2~g}}<extra></extra>",
                 **place(number, columns),
             )  # fmt: skip
@@ -390,7 +390,7 @@ def _is_text(factor: Factor) -> bool:
 def _colors(factor: Factor, count: int) -> list[str]:
     """A colour for each value: in order for numbers, far apart for names."""
     if _is_text(factor):
-        return [_PALETTE[i % len(_PALETTE)] for i in range(count)]
+        return [SERIES[i % len(SERIES)] for i in range(count)]
     colors: list[str] = sample_colorscale("Viridis", np.linspace(0.05, 0.85, count).tolist())
     return colors
 

@@ -1,13 +1,14 @@
 """The figures of a sweep over up to three of its factors, as SVG for documents."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from html import escape
 from math import ceil, floor, isfinite, log10
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from hil.look import GRID, SERIES
+from hil.reports import svg
 from hil.sweep.analysis import Level
 from hil.sweep.study import Factor, Study
 from hil.sweep.sweep import SweepResult
@@ -15,12 +16,10 @@ from hil.sweep.units import headed, label_of, unit_of_factor, unit_of_figure
 from plant.errors import InputError
 from plant.files import write_whole
 
-_INK, _FAINT, _LINE = "#26323d", "#66727e", "#dfe4e9"
-_COLORS = ("#3b6fb6", "#e8871e", "#3a9d6e", "#c8403f", "#8a5fb0", "#3fa7b8")
 _LEFT, _TOP, _WIDTH, _HEIGHT, _GAP, _BELOW = 74, 62, 210, 175, 18, 40
 _SPREAD = 14.0
 """How far the points of two colours at the same value are apart."""
-_MOST = len(_COLORS)
+_MOST = 6
 """The most values of a factor, and figures."""
 
 
@@ -88,15 +87,13 @@ def picture_svg(result: SweepResult) -> str:
     body = _legend(colored[0], series) if colored else []
     for column, panel in enumerate(panels if columned else ()):
         middle = _LEFT + column * (_WIDTH + _GAP) + _WIDTH / 2
-        body.append(_text(middle, _TOP - 10, f"{_heading(result, columned[0])}: {panel.label}", "middle"))
+        body.append(svg.text(middle, _TOP - 10, f"{_heading(result, columned[0])}: {panel.label}", "middle"))
     for row, name in enumerate(figures):
         body += _row(result, name, _TOP + row * (_HEIGHT + _BELOW), (panels, series, places))
     width, height = _LEFT + len(panels) * (_WIDTH + _GAP), _TOP + len(figures) * (_HEIGHT + _BELOW) + 22
     explained = f"{_heading(result, along)}; dots: median with its 95 % confidence; dashes: 90 % of the runs lie below"
-    body.append(_text(_LEFT, height - 8, explained, "start", _FAINT))
-    style = f'font-family="system-ui, sans-serif" font-size="12" fill="{_INK}"'
-    drawn = "\n".join(body)
-    return f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" {style}>\n{drawn}\n</svg>'
+    body.append(svg.text(_LEFT, height - 8, explained))
+    return svg.document(width, height, body)
 
 
 def _parts(result: SweepResult, *factors: Factor) -> list[_Part]:
@@ -112,10 +109,10 @@ def _heading(result: SweepResult, factor: Factor) -> str:
 
 
 def _legend(factor: Factor, series: Sequence[_Part]) -> list[str]:
-    drawn, at = [_text(_LEFT, 20, f"{factor.name}:", "start")], _LEFT + 20.0 + 7.0 * len(factor.name)
-    for each, color in zip(series, _colors(series), strict=True):
+    drawn, at = [svg.text(_LEFT, 20, f"{factor.name}:", "start")], _LEFT + 20.0 + 7.0 * len(factor.name)
+    for each, color in zip(series, SERIES, strict=False):
         drawn.append(f'<circle cx="{at:.0f}" cy="16" r="4.5" fill="{color}"/>')
-        drawn.append(_text(at + 9, 20, each.label, "start"))
+        drawn.append(svg.text(at + 9, 20, each.label, "start"))
         at += 32.0 + 7.0 * len(each.label)
     return drawn
 
@@ -137,13 +134,11 @@ def _row(
     most = scale * max(filter(isfinite, ends))
     step = _step(most)
     middle = top + _HEIGHT / 2
-    drawn = [
-        f'<text transform="translate(18 {middle:.0f}) rotate(-90)" text-anchor="middle">{escape(headed(name, unit))}</text>'
-    ]
+    drawn = [svg.upright_text(18, middle, headed(name, unit))]
     for i in range(len(panels)):
         axes = _Axes(_LEFT + i * (_WIDTH + _GAP), top, step * ceil(most / step), step)
         drawn += _frame(axes, places, i == 0)
-        for j, color in enumerate(_colors(series)):
+        for j, color in enumerate(SERIES[: len(series)]):
             shift = _SPREAD * (j - (len(series) - 1) / 2.0)
             own = {axes.x(k, len(places)) + shift: levels[i, j, k] for k in range(len(places)) if (i, j, k) in levels}
             drawn += _series(axes, own, scale, color)
@@ -153,11 +148,11 @@ def _row(
 def _frame(axes: _Axes, places: Sequence[_Part], numbered: bool) -> Iterator[str]:
     for number in range(round(axes.end / axes.step) + 1):
         value = number * axes.step
-        yield f'<path d="M{axes.left:.1f} {axes.y(value):.1f}h{_WIDTH}" stroke="{_LINE}"/>'
+        yield f'<path d="M{axes.left:.1f} {axes.y(value):.1f}h{_WIDTH}" stroke="{GRID}"/>'
         if numbered:
-            yield _text(axes.left - 6, axes.y(value) + 4, f"{value:.4g}", "end")
+            yield svg.text(axes.left - 6, axes.y(value) + 4, f"{value:.4g}", "end")
     for k, place in enumerate(places):
-        yield _text(axes.x(k, len(places)), axes.top + _HEIGHT + 16, place.label, "middle")
+        yield svg.text(axes.x(k, len(places)), axes.top + _HEIGHT + 16, place.label, "middle")
 
 
 def _series(axes: _Axes, levels: Mapping[float, Level], scale: float, color: str) -> Iterator[str]:
@@ -171,17 +166,9 @@ def _series(axes: _Axes, levels: Mapping[float, Level], scale: float, color: str
         yield f'<circle cx="{x:.1f}" cy="{axes.y(scale * half.value):.1f}" r="4" fill="{color}"/>'
 
 
-def _colors(series: Sequence[_Part]) -> list[str]:
-    return [_COLORS[i % len(_COLORS)] for i in range(len(series))]
-
-
 def _step(most: float) -> float:
     """The distance of four to ten lines from 0 to a value: 1, 2 or 5 times a power of ten."""
     if most <= 0.0:
         return 1.0
     decade = 10.0 ** floor(log10(most / 4.0))
     return max(times * decade for times in (1.0, 2.0, 5.0) if times * decade <= most / 4.0 * (1.0 + 1e-12))
-
-
-def _text(x: float, y: float, text: str, anchor: str, color: str = _INK) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{color}">{escape(text)}</text>'

@@ -12,7 +12,8 @@ from plotly.subplots import make_subplots
 from controller.design.stability import Response, sensitivity, single_loops, step_responses
 from controller.design.tuning import FIGURES, Design
 from controller.workspace import AXES
-from hil.reports.page import COLORS, FAINT, INK, LAYOUT, LEG_NAMES, LEGEND, figure_html, place, write_page
+from hil.look import COLORS, FAINT, LEG_NAMES, NEUTRAL
+from hil.reports.page import LAYOUT, LEGEND, figure_html, place, write_page
 from hil.table import Table
 from plant.mechanism.loads import moving_axes
 
@@ -106,7 +107,7 @@ def _nyquist(design: Design, shown: Shown) -> go.Figure:
     figure.add_scatter(
         x=-1.0 + radius * np.cos(turn), y=radius * np.sin(turn), line={"color": FAINT}, name="allowed peak", hoverinfo="skip"
     )
-    figure.add_scatter(x=[-1.0], y=[0.0], mode="markers", marker={"color": INK, "symbol": "cross"}, showlegend=False)
+    figure.add_scatter(x=[-1.0], y=[0.0], mode="markers", marker={"color": NEUTRAL, "symbol": "cross"}, showlegend=False)
     figure.update_xaxes(range=[-_NEAR, 1.0], title_text="real part")
     figure.update_yaxes(range=[-_NEAR, _NEAR], scaleanchor="x", title_text="imaginary part")
     return figure.update_layout(LAYOUT, height=560, legend=LEGEND)
@@ -143,7 +144,7 @@ def _maps(design: Design) -> go.Figure:
                 x=np.round(moves[:, x], 2), y=np.round(moves[:, y], 2), mode="markers", showlegend=False,
                 marker={
                     "color": np.round(values, 3), "colorscale": "Viridis", "reversescale": greatest, "size": 9,
-                    "showscale": column == 0, "colorbar": bar, "line": {"color": INK, "width": 0.5},
+                    "showscale": column == 0, "colorbar": bar, "line": {"color": NEUTRAL, "width": 0.5},
                 },
                 hovertemplate=f"{name} %{{marker.color:.3~g}} {unit}<extra></extra>",
                 **place(row * len(planes) + column, len(planes)),

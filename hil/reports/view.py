@@ -5,20 +5,19 @@ from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
-from numpy.typing import NDArray
 
-from hil.reports.page import AXIS_NAMES, COLORS, FAINT
+from hil.look import AXIS_NAMES, BASE_COLOR, COLORS, FAINT, GRID, LEG_SCALE, NEUTRAL, PLATFORM_COLOR
 from plant.pose import Array
 
 VIEW = {"margin": {"l": 0, "r": 0, "t": 0, "b": 10}, "showlegend": False}
-PLATFORM, BASE = ("#6d87a3", 0.55, "#3d5670"), (FAINT, 0.35, "#5c6873")
+PLATFORM, BASE = (PLATFORM_COLOR, 0.55, PLATFORM_COLOR), (FAINT, 0.35, BASE_COLOR)
 """The look of a view, and of its plates."""
 
 
 def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any]:
-    """Fixed axes with equal scales around `points` (N, 3), seen from above, or along `front` (3,)."""
-    margin = 0.05 * np.ptp(points, axis=0).max()
-    ranges = np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin], axis=1)
+    """Fixed axes with equal scales around `points` (N, 3), of which some may be NaN, seen from above, or along `front` (3,)."""
+    margin = 0.05 * (np.nanmax(points, axis=0) - np.nanmin(points, axis=0)).max()
+    ranges = np.stack([np.nanmin(points, axis=0) - margin, np.nanmax(points, axis=0) + margin], axis=1)
     aside = np.array([1.15, -1.4, 0.0])
     eye = aside + (0.6 - aside @ up) * up
     if front is not None:
@@ -26,7 +25,7 @@ def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any
         spans = np.ptp(ranges, axis=1)
         eye = 1.2 * spans.max() / np.cbrt(spans.prod()) * front
     looks = {"up": up, "eye": eye, "center": -0.1 * up}
-    look = {"showbackground": False, "showspikes": False, "gridcolor": "#e3e7eb", "color": FAINT, "nticks": 5}
+    look = {"showbackground": False, "showspikes": False, "gridcolor": GRID, "color": NEUTRAL, "nticks": 5}
     return {
         **{
             f"{name}axis": {"range": ends.tolist(), "title": {"text": f"{name} [mm]"}, **look}
@@ -37,15 +36,6 @@ def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any
         "dragmode": "turntable" if up[2] > 0.999 else "orbit",
         "camera": {key: dict(zip(AXIS_NAMES, vector.tolist(), strict=True)) for key, vector in looks.items()},
     }
-
-
-def ring(joints: Array) -> NDArray[np.intp]:
-    """The indices of `joints` (6, 3) in their order round the centre, and the first again."""
-    center = joints - joints.mean(axis=0)
-    plane = np.linalg.svd(center)[2][:2]
-    x, y = plane @ center.T
-    order = np.argsort(np.arctan2(y, x))
-    return np.append(order, order[0])
 
 
 def segments(starts: Array, ends: Array) -> Array:
@@ -66,6 +56,12 @@ def coordinates(points: Array) -> dict[str, Array]:
 def line(points: Array, color: str | list[str], width: float) -> go.Scatter3d:
     """A line through points (n, 3)."""
     return go.Scatter3d(coordinates(points), mode="lines", line={"color": color, "width": width}, hoverinfo="skip")
+
+
+def shaded_line(points: Array, shares: Array, width: float) -> go.Scatter3d:
+    """A line through points (n, 3), with the colours of legs by shares (n,)."""
+    drawn = line(points, NEUTRAL, width)
+    return drawn.update(line={"color": shares.astype(np.float32), "colorscale": LEG_SCALE, "cmin": 0.0, "cmax": 1.0})
 
 
 def plate(rim: Array, color: str, opacity: float, edge: str) -> tuple[go.Mesh3d, go.Scatter3d]:

@@ -1,24 +1,18 @@
 """The slices of a workspace, as SVG for documents and reports: what is reached, and which limit binds elsewhere."""
 
 from collections.abc import Iterator, Sequence
-from html import escape
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from controller.workspace import KINDS, LIMITS, Slice
+from hil.look import NEUTRAL, SERIES
+from hil.reports import svg
 from hil.studies.workspace import Workspace
 from plant.files import write_whole
 
-_INK, _FAINT = "#26323d", "#66727e"
-_COLORS = dict(
-    zip(
-        KINDS,
-        ("#3b6fb6", "#e8871e", "#3a9d6e", "#c8403f", "#8a5fb0", "#3fa7b8", "#b0a03a", "#7d5a44", "#e377c2", "#7f7f7f"),
-        strict=True,
-    )
-)
+_COLORS = dict(zip(KINDS, SERIES, strict=True))
 _OPACITIES = (0.3, 0.42, 0.54, 0.66, 0.78, 0.9)
 _LEFT, _TOP, _SIZE, _GAP, _BELOW = 64, 64, 300, 70, 74
 
@@ -42,9 +36,7 @@ def picture_svg(found: Sequence[Workspace]) -> str:
             body += _slice(each, workspace.label, _LEFT + column * (_SIZE + _GAP), top)
     body += _legend(_kinds(found))
     width, height = _LEFT + columns * (_SIZE + _GAP), _TOP + len(found) * (_SIZE + _BELOW)
-    style = f'font-family="system-ui, sans-serif" font-size="12" fill="{_INK}"'
-    drawn = "\n".join(body)
-    return f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" {style}>\n{drawn}\n</svg>'
+    return svg.document(width, height, body)
 
 
 def _kinds(found: Sequence[Workspace]) -> list[str]:
@@ -54,10 +46,10 @@ def _kinds(found: Sequence[Workspace]) -> list[str]:
 
 def _legend(kinds: Sequence[str]) -> Iterator[str]:
     at = float(_LEFT)
-    yield _text(at, 18, "white: reached; in colour: what is exceeded most, a shade for each leg:", "start", _FAINT)
+    yield svg.text(at, 18, "blank: reached; in colour: what is exceeded most, a shade for each leg:")
     for kind in kinds:
         yield f'<rect x="{at:.0f}" y="26" width="12" height="12" fill="{_COLORS[kind]}"/>'
-        yield _text(at + 17, 36, kind, "start")
+        yield svg.text(at + 17, 36, kind, "start")
         at += 36.0 + 7.0 * len(kind)
 
 
@@ -76,29 +68,25 @@ def _slice(part: Slice, label: str, left: float, top: float) -> Iterator[str]:
                     f'<rect x="{left + start * wide:.2f}" y="{y:.2f}" width="{(stop - start) * wide + 0.3:.2f}" '
                     f'height="{high + 0.3:.2f}" fill="{_COLORS[limit.kind]}" fill-opacity="{shade}"/>'
                 )
-    yield f'<rect x="{left}" y="{top}" width="{_SIZE}" height="{_SIZE}" fill="none" stroke="{_FAINT}"/>'
+    yield f'<rect x="{left}" y="{top}" width="{_SIZE}" height="{_SIZE}" fill="none" stroke="{NEUTRAL}"/>'
     for axis, ends, along in ((part.axes[0], part.columns, True), (part.axes[1], part.rows, False)):
         scale, unit = (np.degrees(1.0), "deg") if axis.startswith("r") else (1e3, "mm")
         for share in (0.0, 0.5, 1.0):
             value = f"{scale * (ends[0] + share * (ends[-1] - ends[0])):.3g}"
             if along:
-                yield _text(left + share * _SIZE, top + _SIZE + 15, value, "middle")
+                yield svg.text(left + share * _SIZE, top + _SIZE + 15, value, "middle")
             else:
-                yield _text(left - 5, top + _SIZE * (1.0 - share) + 4, value, "end")
+                yield svg.text(left - 5, top + _SIZE * (1.0 - share) + 4, value, "end")
         name = f"{axis} [{unit}]"
         if along:
-            yield _text(left + 0.25 * _SIZE, top + _SIZE + 15, name, "middle", _FAINT)
+            yield svg.text(left + 0.25 * _SIZE, top + _SIZE + 15, name, "middle")
         else:
             x, y = left - 30, top + 0.75 * _SIZE
-            yield f'<text transform="translate({x} {y}) rotate(-90)" text-anchor="middle" fill="{_FAINT}">{name}</text>'
-    yield _text(left + 0.5 * _SIZE, top - 6, label, "middle")
+            yield svg.upright_text(x, y, name)
+    yield svg.text(left + 0.5 * _SIZE, top - 6, label, "middle")
 
 
 def _runs(values: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
     """Where runs of equal values begin and end."""
     changes = np.flatnonzero(np.diff(values)) + 1
     yield from zip([0, *changes.tolist()], [*changes.tolist(), len(values)], strict=True)
-
-
-def _text(x: float, y: float, text: str, anchor: str, color: str = _INK) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{color}">{escape(text)}</text>'

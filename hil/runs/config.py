@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from controller.planning import OPERATOR_TARGET, STREAM_TARGET
-from hil.option import integers, option
+from hil.option import Named, NamedOrNone, integers, named, option
 from hil.runs.names import name_objects
 from plant.checks import check_duration, check_rate, check_time_scale, checked_seed, nearest
 from plant.encoders import NO_LENGTHS, EncoderFault, encoder_fault
@@ -16,8 +16,18 @@ from plant.imu_disturbances import BASE_PREFIX, Disturbance, disturbance_of_text
 from plant.imu_wiring import ALL_IMUS, RIGHT_WIRING, Wiring, require_imus
 
 if TYPE_CHECKING:
-    from controller.frames import ActiveFrames
+    from typing import Never
+
+    from controller.calibration.file import Calibration
+    from controller.frames import ActiveFrames, Frames
+    from controller.planning.motions import Motion
+    from controller.planning.target import Target, TargetFunction
+    from hil.rigs import Rig
     from plant.compiled import Record
+    from plant.encoders import EncoderModel
+    from plant.fmu.binding import Binding
+    from plant.imu import ImuModel
+    from plant.mechanism import Mechanism, PlanarMechanism
 
 FUSIONS = {
     "compiled": None,
@@ -40,11 +50,13 @@ RIGS = ("fmu", "udp", "canopen", "replay")
 DRIVES = VELOCITY_DRIVES, POSITION_DRIVES = "velocity", "position"
 """What the drives close a loop of: nothing, as they turn a velocity into a voltage, or their position."""
 
-OF_RUNS = ("rig", "rig_at", "arm", "points", "token_file")
+OF_RUNS = ("rig", "rig_at", "arm", "channel", "points", "token_file")
 """Fields that say something to a run on the clock alone, and nothing to a simulation."""
 
 OPERATOR_CHANNEL = "127.0.0.1:47300"
-"""Where a run listens for its operator, if its target names no address."""
+"""Where a run listens for operators and observers, if nothing names another address."""
+
+NO_CHANNEL = "none"
 
 PYTHON_RIG = "python:"
 """The prefix of a rig in the user's own Python class, such as python:my_rig:MyRig (module and class)."""
@@ -79,7 +91,8 @@ class SimulationConfig:
     """What to simulate, or to run on the clock.
 
     Where a mechanism, target, IMU, encoder, frames, calibration or binding is named, the object itself will do, too; the field
-    then names a preset, or a file in gough's cache that holds it. Fields that are options say below what they mean; the others:
+    then names a preset, or a file in gough's cache that holds it. A target may be a function of time, too
+    (`controller.planning.target.TargetFunction`). Fields that are options say below what they mean; the others:
 
     Attributes:
         hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.
@@ -88,8 +101,8 @@ class SimulationConfig:
         open_loop: whether the drives follow the planned speeds, and IMUs only show a drive that does not: before a calibration.
     """
 
-    mechanism: str = option("hexapod", MECHANISM)
-    target: str = option(
+    mechanism: Named["Mechanism | PlanarMechanism"] = named("hexapod", MECHANISM)
+    target: Named["Target | Motion | TargetFunction"] = named(
         "circle",
         "hold, circle, sines, steps, near-rests, rests, shaking, probing, a motion file (docs/motions.md), or a CSV file of "
         "displacements from home (time_s,x_m,y_m,z_m,qw,qx,qy,qz); for 'gough run' also stream or stream:HOST:PORT, as "
@@ -97,7 +110,7 @@ class SimulationConfig:
     )
     duration: float = option(10.0, "duration of the motion, after the hold on the brakes", unit="s")
     rate: float = option(1000.0, "cycles per second, 50 to 4000", unit="Hz")
-    imu: str = option("mpu9150-calibrated", IMU)
+    imu: Named["ImuModel"] = named("mpu9150-calibrated", IMU)
     seed: int = option(0, "seed of the IMUs' imperfections")
     fusion: str = option(
         "compiled",
@@ -105,10 +118,10 @@ class SimulationConfig:
         "of both sensors, of the gyroscopes, or with scales and alignments; section-5: the paper's, the orientation from the "
         "platform's IMU with --magnetometer, the position from the legs; filterpy: as compiled, but on filterpy (slow)",
     )
-    calibration: str | None = option(None, CALIBRATION, metavar="FILE.toml")
+    calibration: NamedOrNone["Calibration"] = named(None, CALIBRATION, metavar="FILE.toml")
     hold: float | None = None
-    plant: str | None = option(None, "Co-Simulation FMU (FMI 2.0 or 3.0) instead of the built one", metavar="FILE.fmu")
-    binding: str | None = option(
+    plant: NamedOrNone["Never"] = named(None, "Co-Simulation FMU (FMI 2.0 or 3.0) instead of the built one", metavar="FILE.fmu")
+    binding: NamedOrNone["Binding"] = named(
         None, "which of the FMU's variables are which, if they have other names (docs/fmu.md)", metavar="FILE.toml"
     )
     settings: tuple[Setting, ...] = option(
@@ -137,7 +150,7 @@ class SimulationConfig:
     joint_error: float = option(
         0.0, "simulated: standard deviation of each coordinate of the joints from their places", unit="mm"
     )
-    lengths: str = option(
+    lengths: Named["EncoderModel"] = named(
         NO_LENGTHS,
         "encoders of the legs' lengths: none, incremental, absolute, or a TOML file (docs/encoders.md)",
         metavar="KIND",
@@ -149,7 +162,7 @@ class SimulationConfig:
         choices=DRIVES,
     )
     base_imu: bool = option(False, "IMU 7 is on the base, which may move then (docs/moving_base.md)")
-    frames: str | None = option(
+    frames: NamedOrNone["Frames"] = named(
         None, "frames of your own, in which targets, errors and read-outs are (docs/frames.md)", metavar="FILE.toml"
     )
     frame: str | None = option(
@@ -170,15 +183,23 @@ class SimulationConfig:
     time_scale: float = option(
         1.0, "factor on the times of the target: 2 is half as fast, as what is too fast is told to take; 0.01 to 1000"
     )
-    points: str | None = option(None, "with --target operator: named points to go to (docs/operating.md)", metavar="FILE.toml")
-    token_file: str | None = option(
+    channel: str | None = option(
         None,
-        "with --target operator: the token that clients must give, which an address beyond this machine needs; also the "
-        "variable GOUGH_TOKEN",
+        "where the run listens for 'gough panel' and other clients, which may watch it and end it, or none (docs/operating.md)",
+        metavar="HOST:PORT",
+        shown=f"{OPERATOR_CHANNEL} if it is free",
+    )
+    points: NamedOrNone["Never"] = named(
+        None, "with --target operator: named points to go to (docs/operating.md)", metavar="FILE.toml"
+    )
+    token_file: NamedOrNone["Never"] = named(
+        None,
+        "the token that clients of the channel must give, which an address beyond this machine needs; also the variable "
+        "GOUGH_TOKEN",
         metavar="FILE",
     )
     magnetometer: bool = option(False, "the platform's magnetometer gives its heading")
-    rig: str = option(
+    rig: Named["type[Rig]"] = named(
         "fmu",
         "what is driven: fmu, the plant; udp or canopen, a rig on a bus; replay, a recording; or python:MODULE:CLASS, a rig "
         "of your own, as hil/rigs/template.py is one",
@@ -220,9 +241,15 @@ class SimulationConfig:
             raise InputError(
                 f"--fault is for a simulated plant, not for the rig {self.rig}: tell it to 'gough emulate' or 'inject'"
             )
-        if not self.operated and (self.points is not None or self.token_file is not None):
-            name = "--points" if self.points is not None else "--token-file"
-            raise InputError(f"{name} is for a run that an operator moves: add --target operator, or leave it out")
+        if not self.operated and self.points is not None:
+            raise InputError("--points is for a run that an operator moves: add --target operator, or leave it out")
+        if self.channel == NO_CHANNEL and (self.operated or self.token_file is not None):
+            what = "an operator moves the platform" if self.operated else "--token-file gives its token"
+            raise InputError(f"--channel is {NO_CHANNEL}, but {what} over the channel: leave one of them out")
+        if self.operated and ":" in self.target and self.channel is not None:
+            raise InputError(
+                f"--target {self.target} and --channel {self.channel} both say where the channel is: leave one out"
+            )
         # Refuses words that none understands.
         self.base_motions  # noqa: B018
         for each in self.disturbances:
@@ -318,6 +345,14 @@ class SimulationConfig:
     def operated(self) -> bool:
         """Whether an operator moves the platform while the loop runs."""
         return self.target == OPERATOR_TARGET or self.target.startswith(f"{OPERATOR_TARGET}:")
+
+    @property
+    def channel_address(self) -> str | None:
+        """Where the run listens for clients; None for no channel."""
+        if self.channel == NO_CHANNEL:
+            return None
+        named = self.target.partition(":")[2] if self.operated else ""
+        return named or self.channel or OPERATOR_CHANNEL
 
     @property
     def streamed(self) -> bool:

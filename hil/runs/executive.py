@@ -25,16 +25,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.frames import ActiveFrames, Frames
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.pace import least_time_scale
 from controller.planning.plan_handover import END_PLANNER, STREAM, fail_stream
-from controller.planning.points import load_points
 from controller.planning.stream_planner import StreamPlanner
 from controller.safety.arming import describe_obstacle
 from controller.safety.causes import Cause, Reaction
 from controller.workspace import PoseGuard
-from hil.loop.driver import Loop, prevent_compilation, stop_quickly
+from hil.loop.driver import FmuRig, Loop, prevent_compilation, stop_quickly
+from hil.loop.own_stages import Stages, ordered, replacements_of
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
 from hil.loop.stage_times import over_budget
 from hil.progress import Say, say_nothing
@@ -44,9 +43,8 @@ from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_s
 from hil.rigs import Rig
 from hil.rigs.udp.link import parse_address
 from hil.rigs.udp.rig import UdpRig
-from hil.runs.config import OPERATOR_CHANNEL, SimulationConfig
-from hil.runs.operated_platform import Workplace
-from hil.runs.operator_messages import channel_address, load_token
+from hil.runs.channel_process import channel_process
+from hil.runs.config import SimulationConfig
 from hil.runs.prepare import demands_of, prepared_loop, rig_of
 from hil.runs.recorders import Recorders, claimed
 from hil.runs.run_state import RunState
@@ -78,6 +76,7 @@ def run(
     show: Callable[[RunState], None] = lambda state: None,
     rig: Callable[[Loop], Rig] | None = None,
     say: Say = say_nothing,
+    stages: Stages | None = None,
 ) -> dict[str, Any]:
     """Run the closed loop on the machine's clock, to the end of its motion or until it is asked to stop.
 
@@ -90,13 +89,14 @@ def run(
         show: called ten times a second.
         rig: makes a rig in Python, in the loop's process, instead of the configuration's. Its threads must have ended then.
         say: called with each remark before the loop runs.
+        stages: functions in place of stages of the cycle. They run in the loop's process, within a period.
 
     Returns:
         The summary: `cause` of the stop, `cycles`, missed periods by cause and most in a row, `timing_us` and which of it is
-        `over_budget`, `target_stretch` (`controller.planning.pace`), `errors_m`, the number of cycles `unseen` by these,
-        `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles lost), `remarks`, `refused`, `events`, `config`,
-        `version`; of a rig on a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a dry run the
-        `obstacle` to arming, "" if there is none.
+        `over_budget`, `target_stretch` (`controller.planning.pace`), `errors_m` and `errors_rad`, the number of cycles `unseen`
+        by these, `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles lost), `remarks`, `refused`, `events`,
+        `config`, `version`; of a rig on a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a
+        dry run the `obstacle` to arming, "" if there is none.
 
     Raises:
         GoughError: something in the configuration or the settings cannot be used; nothing has run.
@@ -108,18 +108,24 @@ def run(
     link: NDArray[np.int64] = shared_array(LINK_SIZE, np.dtype(np.int64))
     link[Link.SUPERVISOR] = os.getpid()
     state = RunState(frames=config.active_frames)
-    ours, theirs = FORK.Pipe()
-    recorders = Recorders(recording, records, link, ours, state.events)
-    with _asked_to_stop(link), claimed(recording), _reported(state, recorders), contextlib.ExitStack() as at_end:
+    with _asked_to_stop(link), claimed(recording), contextlib.ExitStack() as at_end:
+        stream: Record | None = shared_array(1, STREAM).reshape(()) if config.streamed else None
+        # Forked before there is a pipe, which they would keep open.
+        remarks: list[str] = []
+        planner = channel = at_end.enter_context(channel_process(config, records, link, stream, remarks.append))
+        if stream is not None and not config.operated:
+            planner = at_end.enter_context(_receiver(config, stream))
+        ours, theirs = FORK.Pipe()
+        recorders = Recorders(recording, records, link, ours, state.events)
+        at_end.enter_context(_reported(state, recorders))
         at_end.callback(recorders.finish)
-        stream, planner = at_end.enter_context(_receiver(config, records, link)) if config.streamed else (None, None)
-        loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream)
+        loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream, stages or Stages())
         theirs.close()
         leftovers: list[Path | None] = []
         at_end.callback(_end, loop, link, leftovers)
         leftovers.append(_prepared(ours, loop, link, show, state))
         header, state.refused = _prepared(ours, loop, link, show, state)
-        for remark in header["config"]["remarks"]:
+        for remark in (*remarks, *header["config"]["remarks"]):
             say(remark)
         recorders.start(header)
         with contextlib.suppress(BrokenPipeError):
@@ -132,6 +138,9 @@ def run(
                 state.events.append(f"the loop has not answered for {PATIENCE_S:g} s and was killed: the rig brakes by itself")
                 loop.kill()
             recorders.watch()
+            if channel is not None and not config.operated and not channel.is_alive():
+                state.events.append(f"the channel has died (exit code {channel.exitcode}): nobody can watch this run any more")
+                channel = None
             if stream is not None and planner is not None and not planner.is_alive():
                 # At rest nothing else would tell that nobody can move the platform any more.
                 fail_stream(stream, Cause.TARGET_LOST, -1, np.nan, np.nan)
@@ -176,31 +185,18 @@ def _asked_to_stop(link: NDArray[np.int64]) -> Iterator[None]:
 
 
 @contextmanager
-def _receiver(config: SimulationConfig, records: Record, link: NDArray[np.int64]) -> Iterator[tuple[Record, BaseProcess]]:
-    """The memory that the process of a target which comes while the loop runs shares with the loop, and that process."""
-    stream: Record = shared_array(1, STREAM).reshape(())
-    mechanism, period = load_spatial(config.mechanism), 1.0 / config.rate
-    demands = demands_of(config, mechanism)
-    with contextlib.ExitStack() as opened:
-        if config.operated:
-            # Only a run with an operator loads it.
-            from hil.runs.operator_channel import open_channel, serve_operator
-
-            token = load_token(config.token_file)
-            host, port = channel_address(config.target.partition(":")[2] or OPERATOR_CHANNEL, token)
-            points = {} if config.points is None else load_points(config.points)
-            workplace = Workplace(mechanism, config.active_frames or ActiveFrames(Frames()), demands, points)
-            listener = opened.enter_context(open_channel(host, port))
-            process = started(serve_operator, stream, listener, token, workplace, period, records, link)
-        else:
-            host, port = parse_address(config.target.partition(":")[2] or f"{HOST}:{PORT}")
-            start = mechanism.require_home()
-            lengths = leg_lengths(mechanism, start.position, start.rotation)
-            planner = StreamPlanner(mechanism, lengths, config.active_frames, PoseGuard(mechanism, demands))
-            listener = opened.enter_context(open_socket(host, port))
-            process = started(receive, stream, planner, listener, period)
+def _receiver(config: SimulationConfig, stream: Record) -> Iterator[BaseProcess]:
+    """The process that receives a streamed target while the context lasts, and plans in the memory that the loop shares."""
+    mechanism = load_spatial(config.mechanism)
+    host, port = parse_address(config.target.partition(":")[2] or f"{HOST}:{PORT}")
+    start = mechanism.require_home()
+    lengths = leg_lengths(mechanism, start.position, start.rotation)
+    guard = PoseGuard(mechanism, demands_of(config, mechanism))
+    planner = StreamPlanner(mechanism, lengths, config.active_frames, guard)
+    with open_socket(host, port) as listener:
+        process = started(receive, stream, planner, listener, 1.0 / config.rate)
         try:
-            yield stream, process
+            yield process
         finally:
             stream["shared"][END_PLANNER] = 1
             join_or_kill(process)
@@ -260,6 +256,7 @@ def _prepare_and_follow(
     make_rig: Callable[[Loop], Rig] | None,
     records: Record,
     stream: Record | None,
+    stages: Stages,
 ) -> None:
     with prepared_loop(config, records) as loop, contextlib.ExitStack() as rigs:
         pipe.send(None if loop.plant is None else loop.plant.folder)
@@ -273,6 +270,7 @@ def _prepare_and_follow(
                 "version": version("gough"),
                 "run": run_id,
                 "remarks": list(loop.remarks),
+                "stages": stages.names,
             },
             "parameters": loop.parameters,
             "reference": loop.segments,
@@ -281,7 +279,10 @@ def _prepare_and_follow(
             # Their file may change later.
             header["config"]["frame_definitions"] = loop.frames.frames.text()
         rig = make_rig(loop) if make_rig is not None else rig_of(config)
-        compiled = rig is None or isinstance(rig, UdpRig)
+        if rig is None and stages.names:
+            rig = FmuRig(loop)
+        compiled = (rig is None or isinstance(rig, UdpRig)) and not stages.names
+        replacements = ordered(replacements_of(stages, loop.cycle, loop.parameters, loop.state))
         if isinstance(rig, UdpRig):
             loop.udp = rig.link
         loop.load(python=not compiled)
@@ -300,7 +301,7 @@ def _prepare_and_follow(
             pipe.send((header, refused))
             pipe.recv()
             before = usage()
-            cause = loop.follow(loop.end, None if compiled else rig)
+            cause = loop.follow(loop.end, None if compiled else rig, replacements)
             used = usage().since(before)
         figures = {
             "cause": ": ".join(filter(None, [loop.reason(), loop.failure or getattr(rig, "failure", "")])),
@@ -326,6 +327,7 @@ def _summary(
         "timing_us": timing,
         "over_budget": over_budget(timing, config.fusion),
         "errors_m": state.errors(),
+        "errors_rad": state.rotation_errors(),
         **({} if state.frames is None else {"frames": state.frames.described()}),
         "protection": state.level(),
         "start_up_s": since_process_start() - (time.monotonic() - first),

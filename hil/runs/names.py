@@ -93,17 +93,23 @@ def _mechanism_file(given: Any, config: Any) -> tuple[str, bytes]:
 def _target_file(given: Any, config: Any) -> tuple[str, bytes]:
     """A motion, or the displacements of a target from the home of the configuration's mechanism, or its poses in the frames."""
     from controller.planning.motions import Motion, text_of_motion
-    from controller.planning.target import MOTION_SUFFIX, Target, text_of_target
+    from controller.planning.target import MOTION_SUFFIX, Target, target_of_function, text_of_target
+    from plant.checks import check_time_scale
     from plant.mechanism import load_in_space
 
-    _check_kind("target", given, Target, Motion)
+    function = callable(given)
+    if not function:
+        _check_kind("target", given, Target, Motion)
     if isinstance(given, Motion):
         return f"{_stem(given.name)}{MOTION_SUFFIX}", text_of_motion(given).encode()
     if config is None:
-        raise InputError(
-            f"the target {given.name!r} has no mechanism from whose home it counts: give a motion or a file by name"
-        )
-    return f"{_stem(given.name)}.csv", text_of_target(given, load_in_space(config.mechanism), config.active_frames).encode()
+        name = getattr(given, "name", given)
+        raise InputError(f"the target {name!r} has no mechanism from whose home it counts: give a motion or a file by name")
+    mechanism, frames = load_in_space(config.mechanism), config.active_frames
+    if function:
+        check_time_scale(config.time_scale)
+        given = target_of_function(given, mechanism, config.duration / config.time_scale, frames)
+    return f"{_stem(given.name)}.csv", text_of_target(given, mechanism, frames).encode()
 
 
 def _frames_file(given: Any, config: Any) -> tuple[str, bytes]:

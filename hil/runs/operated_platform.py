@@ -1,8 +1,8 @@
 """What an operator's requests do to the platform of a run: moves, jogs and stops, checked before they begin.
 
-A move is a straight way of the tool (`controller.planning.straight_way`). Plans that follow it go to the loop as those of a
-streamed target do, and all of them end at rest: whatever becomes of the operator or of this process, the platform stops within
-its limits.
+A move is a straight way of the tool (`controller.planning.straight_way`), or one to a goal that may change
+(`controller.planning.followed_goal`). Plans that follow it go to the loop as those of a streamed target do, and all of them end
+at rest: whatever becomes of the operator or of this process, the platform stops within its limits.
 """
 
 import time
@@ -16,6 +16,7 @@ import numpy as np
 from controller.direct_kinematics import poses_from_lengths
 from controller.frames import ActiveFrames, Move
 from controller.inverse_kinematics import leg_lengths
+from controller.planning.followed_goal import FollowedGoal
 from controller.planning.motions.elements import Place, ToolLimits
 from controller.planning.plan_handover import CAUSE, CYCLE, fail_stream, note_sample
 from controller.planning.points import HOME, Point, require_point
@@ -46,6 +47,9 @@ _FARTHEST_M, _FARTHEST_RAD = 1.0, np.pi
 
 _LEAST_JOG = 1e-5
 """A jog that could go no farther is refused [m or rad]."""
+
+_OUT_OF_PLANE = 1e-9
+"""A planar mechanism may be asked to leave its plane by so much, which is rounding [m or rad]."""
 
 _STEP_M, _STEP_RAD = 1e-3, np.radians(0.2)
 """Poses of a way are checked so far apart."""
@@ -114,6 +118,7 @@ class OperatedPlatform:
     Attributes:
         pose: of {2}, where the platform rests or its move has begun.
         jogging: whether it moves only as long as its operator says so.
+        paused: whether it rests, or comes to rest, on a way that can be resumed.
     """
 
     def __init__(self, stream: Record, workplace: Workplace, period: float) -> None:
@@ -121,8 +126,9 @@ class OperatedPlatform:
         _load(workplace)
         self._planner = workplace.planner()
         self._offers = PlanOffers(stream, self._planner, period)
-        self.pose, self.jogging = workplace.home, False
-        self._way: StraightWay | None = None
+        self.pose, self.jogging, self.paused = workplace.home, False, False
+        self._way: StraightWay | FollowedGoal | None = None
+        self._towards: tuple[ActiveFrames, Pose, ToolLimits | None] | None = None  # frames, end and limits of the last way
         self._began = self._offered = 0.0
         self._beaten = self._stepped = 0.0
         self._deadman = DEADMAN_S
@@ -154,17 +160,41 @@ class OperatedPlatform:
             GoughError: the request itself cannot be used.
         """
         self._require_rest()
-        if where == HOME:
-            frames, goal = self._place.frames_of(frame, tool), self._place.home
-        else:
-            if isinstance(where, str):
-                point = require_point(self._place.points, where)
-                where, frame, tool = point.place, frame or point.frame, tool or point.tool
-            frames = self._place.frames_of(frame, tool)
-            there = where.after(Pose(*frames.to_target(self._place.home, self.pose)))
-            goal = frames.from_target(self._place.home, there.position, there.rotation)
+        frames, goal = self._goal(where, frame, tool)
         move = frames.move_between(self.pose, goal)
         return 0.0 if is_nothing(move) else self._begin(frames, move, limits)
+
+    def follow(self, where: Place | str, frame: str | None = None, tool: str | None = None) -> float:
+        """Go to a place or a point, which a later call may change while the platform moves; returns how long it will take [s].
+
+        The goal is held against all limits, and so is every plan on the way, which is not straight: the platform comes to rest
+        before a limit that lies between.
+
+        Raises:
+            RefusedError: the goal exceeds a limit, or the platform cannot move now.
+            GoughError: the request itself cannot be used.
+        """
+        way = self._way if isinstance(self._way, FollowedGoal) and not self._way.stopped else None
+        if way is None:
+            self._require_rest()
+        frames, goal = self._goal(where, frame, tool)
+        move = frames.move_between(self.commanded, goal)
+        self._require_plane(frames, move)
+        mechanism = self._place.mechanism
+        if excess := first_excess(mechanism, np.zeros(1), goal.position[None], goal.rotation[None], self._place.demands):
+            value, bound, unit = excess.shown
+            raise RefusedError(
+                f"{excess.limit.text} would be {value:.5g} {unit}, with a limit of {bound:.5g}: choose another place"
+            )
+        if way is not None:
+            way.aim(goal, self._ahead() - self._began)
+            self._towards = frames, goal, None
+        elif is_nothing(move):
+            return 0.0
+        else:
+            way = FollowedGoal(mechanism, self.pose, goal, SPEED, TURN_SPEED)
+            self._set_out(way, (frames, goal, None))
+        return way.duration + self._began - self.now
 
     def move_by(
         self, translation: Any, rotation_vector: Any, axes: str | None = None, limits: ToolLimits | None = None
@@ -186,6 +216,7 @@ class OperatedPlatform:
             raise InputError(f"deadman is {deadman:g} s; it must be positive, and {MOST_DEADMAN_S:g} s at most")
         rate = Move(velocity, turn_velocity, axes)
         self._place.frames.rate(self.pose, rate)
+        self._require_plane(self._place.frames, rate)
         speeds = [float(np.linalg.norm(np.asarray(each, float))) for each in (velocity, turn_velocity)]
         if not max(speeds) > 0.0:
             raise InputError("the jog has no speed: give one along or about an axis")
@@ -208,21 +239,38 @@ class OperatedPlatform:
         self._beaten = time.monotonic()
 
     def stop(self) -> None:
-        """Come to rest on the way."""
+        """Come to rest on the way, for good."""
         if self._way is not None:
             self._way.stop(self._ahead() - self._began)
             self._ended_by = ""
-        self.jogging = False
+        self.jogging = self.paused = False
+
+    def pause(self) -> None:
+        """Come to rest on the way, which `resume` takes up again; a jog has no end to go on to, and stops."""
+        paused = self._way is not None and not self.jogging
+        self.stop()
+        self.paused = paused
+
+    def resume(self) -> float:
+        """Go on to where the platform went when it was paused; as `go_to`."""
+        self._require_rest()
+        if not self.paused or self._towards is None:
+            raise RefusedError("no move has been paused: there is nothing to go on with")
+        frames, end, limits = self._towards
+        move = frames.move_between(self.pose, end)
+        self.paused = False
+        return 0.0 if is_nothing(move) else self._begin(frames, move, limits)
 
     def lose_operator(self) -> None:
-        """End the run by a controlled stop if the operator has gone while it jogged."""
+        """End the run by a controlled stop if the operator has gone while it jogged; forget what was paused."""
+        self.paused = False
         if self.jogging:
             fail_stream(self._stream, Cause.OPERATOR_LOST, -1, time.monotonic() - self._beaten, self._deadman)
             self.end(Cause.OPERATOR_LOST.short)
 
     def end(self, reason: str) -> None:
         """Note that the run has stopped, and why: nothing moves any more."""
-        self._over, self._way, self.jogging = reason, None, False
+        self._over, self._way, self.jogging, self.paused = reason, None, False, False
 
     def step(self) -> str:
         """Go on with the move; to be called each few milliseconds. Returns what has ended, in words, or ""."""
@@ -250,21 +298,24 @@ class OperatedPlatform:
         return ""
 
     def _rest(self, now: float, behind: bool) -> str:
-        assert self._way is not None
+        way = self._way
+        assert way is not None
         lengths = np.empty((1, self._place.mechanism.legs))
         lengths_along(self._planner.current.segments, np.array([max(now, _end_of(self._planner.current.segments))]), lengths)
-        end = self._way.pose(self._way.duration)
+        end = way.pose(way.duration)
         positions, rotations = poses_from_lengths(self._place.mechanism, lengths, end, partial=True)
         self.pose = Pose(positions[0], rotations[0]) if np.isfinite(positions).all() else end
-        if not behind and not self._way.stopped:
+        if not behind and not way.stopped:
             # Without the rounding of going by the legs' lengths.
             self.pose = end
-        stopped, self._way, self.jogging = self._way.stopped, None, False
+        self._way, self.jogging = None, False
         note_sample(self._stream, 0)
+        if behind and isinstance(way, FollowedGoal):
+            return "stopped before a limit on the way"
         if behind:
             return "the plans did not keep up with the move, which ended early"
-        if stopped:
-            return "stopped"
+        if way.stopped:
+            return "paused" if self.paused else "stopped"
         return f"stopped at a limit: {self._ended_by}" if self._ended_by else "arrived"
 
     def _require_rest(self) -> None:
@@ -276,17 +327,43 @@ class OperatedPlatform:
             raise RefusedError("the platform is moving: stop it first, or wait until it rests")
         self._ended_by = ""
 
+    def _goal(self, where: Place | str, frame: str | None, tool: str | None) -> tuple[ActiveFrames, Pose]:
+        """The frames and the pose of the platform that a place in them, or a named point, means."""
+        if where == HOME:
+            return self._place.frames_of(frame, tool), self._place.home
+        if isinstance(where, str):
+            point = require_point(self._place.points, where)
+            where, frame, tool = point.place, frame or point.frame, tool or point.tool
+        frames = self._place.frames_of(frame, tool)
+        there = where.after(Pose(*frames.to_target(self._place.home, self.commanded)))
+        return frames, frames.from_target(self._place.home, there.position, there.rotation)
+
+    def _require_plane(self, frames: ActiveFrames, move: Move) -> None:
+        """Refuse a move out of the plane of a planar mechanism."""
+        if not self._place.mechanism.planar:
+            return
+        axes = frames.axes(self.pose, move.axes)
+        straight, turn = axes @ np.asarray(move.translation, float), axes @ np.asarray(move.rotation_vector, float)
+        if not max(abs(straight[2]), abs(turn[0]), abs(turn[1])) <= _OUT_OF_PLANE:
+            raise RefusedError(
+                f"{self._place.mechanism.name} moves in its plane alone, along x and y and about z: leave z, rx and ry out"
+            )
+
     def _begin(self, frames: ActiveFrames, move: Move, limits: ToolLimits | None) -> float:
+        self._require_plane(frames, move)
         way = StraightWay(
             self._place.mechanism, frames, self.pose, move, limits or ToolLimits(speed=SPEED, turn_speed=TURN_SPEED)
         )
         self._check(way)
+        self._set_out(way, (frames, way.poses(np.array(1.0)), limits))
+        return way.duration
+
+    def _set_out(self, way: StraightWay | FollowedGoal, towards: tuple[ActiveFrames, Pose, ToolLimits | None]) -> None:
         self._began = self._ahead()
         self._offered = -inf
         self._planner.lead(way)
-        self._way = way
+        self._way, self._towards, self.paused = way, towards, False
         note_sample(self._stream, time.monotonic_ns() + _STALL_NS)
-        return way.duration
 
     def _ahead(self) -> float:
         """The first time from which a plan can still begin [s]."""
@@ -332,8 +409,8 @@ class OperatedPlatform:
 def _load(workplace: Workplace) -> None:
     """Load the machine code of a move: while one goes on there is not enough time."""
     load_handover()
-    up = Move((0.0, 0.0, 1e-3))
-    way, planner = StraightWay(workplace.mechanism, workplace.frames, workplace.home, up), workplace.planner()
+    aside = Move((1e-3, 0.0, 0.0))
+    way, planner = StraightWay(workplace.mechanism, workplace.frames, workplace.home, aside), workplace.planner()
     poses = way.poses(np.array([0.0]))
     first_excess(workplace.mechanism, np.zeros(1), poses.position, poses.rotation, workplace.demands)
     planner.lead(way)
@@ -342,6 +419,7 @@ def _load(workplace: Workplace) -> None:
     lengths = np.empty((1, workplace.mechanism.legs))
     lengths_along(planner.current.segments, np.zeros(1), lengths)
     poses_from_lengths(workplace.mechanism, lengths, workplace.home)
+    FollowedGoal(workplace.mechanism, workplace.home, workplace.home, SPEED, TURN_SPEED).at(0.0)
 
 
 def _scaled(move: Move, factor: float) -> Move:

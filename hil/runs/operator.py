@@ -1,4 +1,4 @@
-"""A client of a run's channel: an operator, or an observer (`operator_messages`).
+"""A client of a run's channel: an operator, or an observer (`operator_messages`). Only a run with an operator can be moved.
 
 with Operator() as operator:
 operator.move("home")
@@ -70,7 +70,7 @@ class Operator:
             self._socket = socket.create_connection((host, port), timeout=patience)
         except OSError as error:
             raise ChannelError(
-                f"no run answers at {address}: {error.strerror or error}: start one with 'gough run --target operator'"
+                f"no run answers at {address}: {error.strerror or error}: start one with 'gough run', or name another --at"
             ) from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
@@ -130,6 +130,12 @@ class Operator:
         """
         answer = self.ask("move", to=to, frame=frame, tool=tool, speed=speed, turn_speed=turn_speed)
         return self.wait(answer["duration"]) if wait else answer
+
+    def follow(self, to: str | Mapping[str, Any], frame: str | None = None, tool: str | None = None) -> dict[str, Any]:
+        """Go to a point or a place as `move` has it, and to the next one at once when it is asked for, without a rest; returns
+        the answer.
+        """
+        return self.ask("follow", to=to, frame=frame, tool=tool)
 
     def step(
         self, translation: Sequence[float] = (0.0, 0.0, 0.0), rotation: Sequence[float] = (0.0, 0.0, 0.0),
@@ -192,9 +198,23 @@ class Operator:
                 return
             self._keep(line)
 
+    def margins(self) -> list[dict[str, Any]]:
+        """How the platform stands to everything that limits it (`hil.runs.telemetry.margins_message`); [] without a pose."""
+        found: list[dict[str, Any]] = self.ask("margins")["margins"]
+        return found
+
     def stop(self) -> None:
         """Let the platform come to rest on its way."""
         self.ask("stop")
+
+    def pause(self) -> None:
+        """Let the platform come to rest on its way, from where `resume` goes on; a jog stops."""
+        self.ask("pause")
+
+    def resume(self, wait: bool = True) -> dict[str, Any]:
+        """Go on to where the platform went when it was paused; as `move`."""
+        answer = self.ask("resume")
+        return self.wait(answer["duration"]) if wait else answer
 
     def end(self) -> None:
         """End the run by a controlled stop."""

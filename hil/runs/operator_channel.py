@@ -1,15 +1,18 @@
-"""The server of an operator's channel, which runs in a process of its own beside the loop's (`operator_messages`).
+"""The server of a run's channel, which runs in a process of its own beside the loop's (`operator_messages`).
 
-    operator --TCP--> channel   checks each request, plans, writes into shared memory and never waits for the loop
-                      loop      takes the plans as they come, as those of a streamed target
+    client --TCP--> channel   tells what the loop's records say, and never waits for the loop
+                              checks an operator's requests, plans, and writes the plans into shared memory
+                    loop      takes them as they come, as those of a streamed target
 
-Any number of observers may watch; one operator at a time gives orders.
+Any number of observers may watch; one operator at a time gives orders. A run whose target is known beforehand cannot be moved,
+but its operator may end it.
 """
 
 import asyncio
 import hmac
 import os
 import socket
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,75 +23,79 @@ from numpy.typing import NDArray
 
 from controller.frames import Move
 from controller.planning.motions.document import place_of
-from controller.planning.motions.elements import ToolLimits
-from controller.planning.plan_handover import END_PLANNER
+from controller.planning.motions.elements import Place, ToolLimits
 from controller.planning.points import HOME
 from controller.safety.causes import Cause
 from hil.loop.records import Link, StopRequest
 from hil.realtime.scheduling import come_before_others
 from hil.recording.mcap import events_of, take
+from hil.runs.channel_process import MOST_CLIENTS
 from hil.runs.operated_platform import DEADMAN_S, SPEED, TURN_SPEED, OperatedPlatform, RefusedError, Workplace
-from hil.runs.operator_messages import MOST_LINE, VERSION, ChannelError, decode, encode, pose_message
-from hil.runs.telemetry import machine_message, state_message, timing_message
+from hil.runs.operator_messages import MOST_LINE, RUN_ENDED, VERSION, decode, encode, pose_message
+from hil.runs.telemetry import (
+    estimated_pose,
+    frames_message,
+    machine_message,
+    margins_message,
+    reference_pose,
+    state_message,
+    timing_message,
+)
 from plant.checks import printable
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
 
 TELEMETRY_HZ = 30.0
 
-_STEP_S = 0.003
+_STEP_S, _LOOK_S, _IDLE_S = 0.003, 0.01, 0.2
+"""How often an operated platform goes on, the records are read for clients, and the end of a run is noticed that has none."""
+
+_MARGINS_S = 0.1
+"""Margins are not found anew for so long, however often they are asked for."""
+
 _TIMING_S = 1.0
 """Of how many seconds the timing is told."""
 
 _HELLO_S = 5.0
 """How long a client may take to say who it is."""
 
-_MOST_CLIENTS = 16
 _MOST_WAITING = 1 << 18
 """Bytes that wait for a client that reads too slowly; it gets no telemetry meanwhile."""
+
+_RESTING = {"time": 0.0, "moving": False, "jogging": False, "paused": False, "mode": "preparing"}
+
+_WATCHING = ("state", "margins", "watch")
+"""What an observer may ask for."""
 
 _ROLES = OPERATOR, OBSERVER = "operator", "observer"
 
 
-def open_channel(host: str, port: int) -> socket.socket:
-    """A socket that listens for operators; port 0 takes a free one.
-
-    Raises:
-        ChannelError: the address cannot be used.
-    """
-    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-        listener.listen(_MOST_CLIENTS)
-    except (OSError, OverflowError) as error:
-        listener.close()
-        raise ChannelError(f"cannot listen for an operator at {host}:{port}: {error}: choose another address") from None
-    return listener
-
-
-def serve_operator(
-    stream: Record,
+def serve_channel(
     listener: socket.socket,
     token: str | None,
     workplace: Workplace,
+    target: str,
     period: float,
     records: Record,
     link: NDArray[np.int64],
+    stream: Record | None = None,
 ) -> None:
-    """Serve operators until `END_PLANNER` is set or the parent process has ended; the body of a process.
+    """Serve clients until the run is done or the parent process has ended; the body of a process.
 
     Args:
-        stream: dtype `STREAM`, shared with the loop.
         listener: from `open_channel`.
         token: that each client must give; None if none is needed.
         workplace: the machine, its frames and its points.
+        target: what the run follows.
         period: of a cycle [s].
         records, link: shared with the loop.
+        stream: dtype `STREAM`, shared with the loop, where an operator moves the platform.
     """
-    platform = OperatedPlatform(stream, workplace, period)
-    come_before_others()
-    asyncio.run(_Channel(stream, platform, workplace, token, period, records, link).run(listener))
+    platform = None
+    if stream is not None:
+        platform = OperatedPlatform(stream, workplace, period)
+        come_before_others()
+    asyncio.run(_Channel(platform, workplace, target, token, period, records, link).run(listener))
 
 
 @dataclass(eq=False)
@@ -110,32 +117,34 @@ class _Client:
 
 class _Channel:
     def __init__(
-        self, stream: Record, platform: OperatedPlatform, workplace: Workplace, token: str | None, period: float,
+        self, platform: OperatedPlatform | None, workplace: Workplace, target: str, token: str | None, period: float,
         records: Record, link: NDArray[np.int64],
     ) -> None:  # fmt: skip
-        self._period = period
-        self._shared, self._platform, self._place, self._token = stream["shared"], platform, workplace, token
+        self._platform, self._place, self._target, self._token, self._period = platform, workplace, target, token, period
         self._records, self._link, self._seen = records, link, 0
         self._latest: Any = None
         self._clients: list[_Client] = []
         self._waiting = 0
+        self._measured, self._told_margins = -np.inf, list[dict[str, Any]]()
         self._doing: dict[str, Callable[[_Client, dict[str, Any]], dict[str, Any]]] = {
-            "move": self._move, "step": self._step_by, "jog": self._jog, "beat": self._beat, "stop": self._stop,
-            "end": self._end, "emergency": self._emergency, "state": self._state, "watch": self._watch,
+            "move": self._move, "follow": self._follow, "step": self._step_by, "jog": self._jog, "beat": self._beat,
+            "stop": self._stop, "pause": self._pause, "resume": self._resume, "end": self._end,
+            "emergency": self._emergency, "state": self._state, "margins": self._margins, "watch": self._watch,
         }  # fmt: skip
 
     async def run(self, listener: socket.socket) -> None:
         """Serve until the run ends."""
-        parent = os.getppid()
+        # The parent may have died already.
+        parent = int(self._link[Link.SUPERVISOR]) or os.getppid()
         server = await asyncio.start_server(self._serve, sock=listener, limit=MOST_LINE)
         clock = asyncio.get_running_loop()
-        while not (self._shared[END_PLANNER] or os.getppid() != parent):
-            if ended := self._platform.step():
+        while not (self._link[Link.DONE] or os.getppid() != parent):
+            if self._platform is not None and (ended := self._platform.step()):
                 self._tell({"event": ended, "pose": pose_message(self._platform.pose)})
             self._look(clock.time())
-            await asyncio.sleep(_STEP_S)
+            await asyncio.sleep(_STEP_S if self._platform is not None else _LOOK_S if self._clients else _IDLE_S)
         self._look(np.inf)
-        self._tell({"event": "the run has ended"})
+        self._tell({"event": RUN_ENDED})
         server.close()
         for client in self._clients:
             client.writer.close()
@@ -143,7 +152,7 @@ class _Channel:
     # ------------------------------------------------------------------------------------------------------------ clients
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._waiting + len(self._clients) >= _MOST_CLIENTS:
+        if self._waiting + len(self._clients) >= MOST_CLIENTS:
             writer.close()
             return
         self._waiting += 1
@@ -163,7 +172,7 @@ class _Channel:
             pass
         finally:
             self._clients.remove(client)
-            if client.role == OPERATOR:
+            if client.role == OPERATOR and self._platform is not None:
                 self._platform.lose_operator()
             writer.close()
 
@@ -212,11 +221,12 @@ class _Channel:
         return "", ""
 
     def _described(self) -> dict[str, Any]:
-        frames = self._place.frames
         return {
+            "operated": self._platform is not None,
+            "target": self._target,
             "mechanism": self._place.mechanism.name,
             "machine": machine_message(self._place.mechanism),
-            "frames": {**frames.described(), "names": list(frames.frames)},
+            "frames": frames_message(self._place.frames),
             "points": [HOME, *self._place.points],
             "home": pose_message(self._place.home),
             "speed": SPEED,
@@ -240,7 +250,7 @@ class _Channel:
                 raise InputError(
                     f"there is nothing to do called {printable(str(do))[:40]!r}; there are {', '.join(self._doing)}"
                 )
-            if client.role != OPERATOR and do not in ("state", "watch"):
+            if client.role != OPERATOR and do not in _WATCHING:
                 raise RefusedError("an observer gives no orders: connect as the operator")
             return {"id": about, "ok": True, **self._doing[do](client, request)}
         except RefusedError as refusal:
@@ -249,17 +259,25 @@ class _Channel:
         except GoughError as error:
             return {"id": about, "ok": False, "kind": "malformed", "error": str(error)}
 
+    @property
+    def _moved(self) -> OperatedPlatform:
+        """The platform, where an operator moves it."""
+        if self._platform is None:
+            raise RefusedError(f"this run follows {self._target}: only one with --target operator can be moved")
+        return self._platform
+
     def _move(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client
-        to = request.get("to")
-        where = to if isinstance(to, str) else place_of(to, "to")
-        frame, tool = _name_in(request, "frame"), _name_in(request, "tool")
-        return {"duration": self._platform.go_to(where, frame, tool, _limits_in(request))}
+        return {"duration": self._moved.go_to(*_goal_in(request), _limits_in(request))}
+
+    def _follow(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client
+        return {"duration": self._moved.follow(*_goal_in(request))}
 
     def _step_by(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client
         move = _move_in(request, "translation", "rotation")
-        return {"duration": self._platform.move_by(move.translation, move.rotation_vector, move.axes, _limits_in(request))}
+        return {"duration": self._moved.move_by(move.translation, move.rotation_vector, move.axes, _limits_in(request))}
 
     def _jog(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client
@@ -267,21 +285,31 @@ class _Channel:
         deadman = request.get("deadman", DEADMAN_S)
         if isinstance(deadman, bool) or not isinstance(deadman, int | float):
             raise InputError("deadman must be a number")
-        return {"duration": self._platform.jog(rate.translation, rate.rotation_vector, rate.axes, deadman)}
+        return {"duration": self._moved.jog(rate.translation, rate.rotation_vector, rate.axes, deadman)}
 
     def _beat(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client, request
-        self._platform.beat()
-        return {"jogging": self._platform.jogging}
+        self._moved.beat()
+        return {"jogging": self._moved.jogging}
 
     def _stop(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client, request
-        self._platform.stop()
+        self._moved.stop()
         return {}
+
+    def _pause(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client, request
+        self._moved.pause()
+        return {}
+
+    def _resume(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client, request
+        return {"duration": self._moved.resume()}
 
     def _end(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client, request
-        self._platform.stop()
+        if self._platform is not None:
+            self._platform.stop()
         self._link[Link.STOP] = max(int(self._link[Link.STOP]), StopRequest.CONTROLLED)
         return {}
 
@@ -292,7 +320,19 @@ class _Channel:
 
     def _state(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client, request
+        self._take()
         return {"telemetry": self._telemetry()}
+
+    def _margins(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
+        del client, request
+        now = time.monotonic()
+        if now - self._measured > _MARGINS_S:
+            self._take()
+            pose = None if self._latest is None else estimated_pose(self._latest)
+            place = self._place
+            self._told_margins = [] if pose is None else margins_message(place.mechanism, pose, place.demands)
+            self._measured = now
+        return {"margins": self._told_margins}
 
     def _watch(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         rate = request.get("rate", TELEMETRY_HZ)
@@ -310,14 +350,11 @@ class _Channel:
 
     def _look(self, now: float) -> None:
         """Take the loop's new records, and send what is due."""
-        records, self._seen, _ = take(self._records, self._link, self._seen)
-        if len(records):
-            self._latest = records[-1].copy()
-            if self._latest["stop"] != Cause.NONE:
-                self._platform.end(Cause(int(self._latest["stop"])).short)
-            for eventful in records[records["event_count"] > 0]:
-                for text in events_of(eventful):
-                    self._tell({"event": text, "cycle": int(eventful["cycle"])})
+        if self._platform is None and not self._clients:
+            # What nobody has seen is told to nobody.
+            self._seen = max(int(self._link[Link.HEAD]) - 1, 0)
+            return
+        self._take()
         due = [each for each in self._clients if each.period < np.inf and now >= each.due]
         if due:
             message = {"telemetry": self._telemetry()}
@@ -326,22 +363,33 @@ class _Channel:
                 if not client.slow:
                     client.send(message)
 
+    def _take(self) -> None:
+        records, self._seen, _ = take(self._records, self._link, self._seen)
+        if not len(records):
+            return
+        self._latest = records[-1].copy()
+        if self._platform is not None and self._latest["stop"] != Cause.NONE:
+            self._platform.end(Cause(int(self._latest["stop"])).short)
+        for eventful in records[records["event_count"] > 0]:
+            for text in events_of(eventful):
+                self._tell({"event": text, "cycle": int(eventful["cycle"])})
+
     def _telemetry(self) -> dict[str, Any]:
         """What the run does now, in SI units."""
-        platform, latest = self._platform, self._latest
-        told: dict[str, Any] = {
-            "time": platform.now,
-            "moving": platform.moving,
-            "jogging": platform.jogging,
-            "commanded": pose_message(platform.commanded),
-            "mode": "preparing",
-        }
+        latest, told = self._latest, dict(_RESTING)
+        if latest is not None:
+            size, done = len(self._records), self._seen
+            count = min(round(_TIMING_S / self._period), done, size // 2)
+            timing = timing_message(self._records, np.arange(done - count, done) % size, self._period)
+            told |= state_message(latest, self._place.frames) | {"timing": timing}
+        if (platform := self._platform) is not None:
+            now = {"time": platform.now, "commanded": pose_message(platform.commanded)}
+            return told | now | {name: getattr(platform, name) for name in ("moving", "jogging", "paused")}
         if latest is None:
             return told
-        size, done = len(self._records), self._seen
-        count = min(round(_TIMING_S / self._period), done, size // 2)
-        timing = timing_message(self._records, np.arange(done - count, done) % size, self._period)
-        return told | state_message(latest, self._place.frames) | {"timing": timing}
+        told |= {"time": int(latest["cycle"]) * self._period, "moving": bool(latest["reference"][:, 1].any())}
+        reference = reference_pose(latest, self._place.mechanism)
+        return told if reference is None else told | {"commanded": pose_message(reference)}
 
 
 def _name_in(request: dict[str, Any], name: str) -> str | None:
@@ -349,6 +397,12 @@ def _name_in(request: dict[str, Any], name: str) -> str | None:
     if not (given is None or isinstance(given, str)):
         raise InputError(f"{name} must be a text")
     return given
+
+
+def _goal_in(request: dict[str, Any]) -> tuple[Place | str, str | None, str | None]:
+    """A place or a point's name, and the frame and the tool."""
+    to = request.get("to")
+    return to if isinstance(to, str) else place_of(to, "to"), _name_in(request, "frame"), _name_in(request, "tool")
 
 
 def _limits_in(request: dict[str, Any]) -> ToolLimits:

@@ -23,6 +23,9 @@ from plant.pose import Pose, rotation_from_vector, vector_from_rotation
 
 VERSION = 1
 MOST_LINE = 65536
+RUN_ENDED = "the run has ended"
+"""The last event."""
+
 TOKEN_VARIABLE = "GOUGH_TOKEN"
 """The variable of the environment that may have the token."""
 

@@ -97,8 +97,8 @@ class PreparedLoop(Loop):
 
 
 @contextmanager
-def prepared_loop(config: SimulationConfig, records: Record | None = None) -> Iterator[PreparedLoop]:
-    """Check everything, load the plant, plan the motion, and load the machine code.
+def prepared_loop(config: SimulationConfig, records: Record | None = None, in_python: bool = False) -> Iterator[PreparedLoop]:
+    """Check everything, load the plant, plan the motion, and load the machine code, or that of a loop that runs `in_python`.
 
     The loop records into `records`, a ring buffer; by default there is room for every cycle.
 
@@ -190,7 +190,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None) -> It
             frames=frames,
         )
         close_loops(loop.loops, position)
-        loop.load(python=config.fusion == "filterpy")
+        loop.load(in_python)
         yield loop
 
 
@@ -213,8 +213,11 @@ def _check_memory(config: SimulationConfig, count: int) -> None:
 def _check_planar(config: SimulationConfig, calibration: Calibration) -> None:
     if config.fusion != "compiled":
         raise InputError(f"fusion {config.fusion!r} is for six legs; for {config.mechanism}, which is planar, take 'compiled'")
-    if config.streamed:
-        raise InputError(f"a target can be streamed to six legs alone; {config.mechanism} is planar: give a motion or a file")
+    if config.streamed and not config.operated:
+        raise InputError(
+            f"a target can be streamed to six legs alone; {config.mechanism} is planar: give a motion or a file, or move it "
+            "with --target operator"
+        )
     if config.frames is not None:
         raise InputError(f"frames are for six legs; {config.mechanism} is planar: leave --frames out")
     if calibration.joints.any():

@@ -1,6 +1,7 @@
 """What the supervisor sees of a run while it goes on."""
 
 from dataclasses import dataclass, field
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from controller.safety.causes import Mode
 from hil.loop.stage_times import Timing
 from hil.recording.mcap import events_of, take
 from plant.compiled import Record
-from plant.pose import rotations_from_quaternions
+from plant.pose import pose_errors, rotations_from_quaternions
 from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
 
 _MOST_EVENTS = 100
@@ -56,14 +57,19 @@ class RunState:
     _seen: int = 0
     _squares: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     _tool_squares: float = 0.0
+    _tracking_squares: float = 0.0
     _counts: NDArray[np.int64] = field(default_factory=lambda: np.zeros(2, np.int64))
 
     def update(self, records: Record, link: NDArray[np.int64]) -> bool:
         """Add the cycles that the loop has recorded meanwhile; returns whether there are any."""
         records, self._seen, unseen = take(records, link, self._seen)
         self.unseen += unseen
-        if not len(records):
-            return False
+        if len(records):
+            self.add(records)
+        return len(records) > 0
+
+    def add(self, records: Record) -> None:
+        """Add cycles (n,), dtype `RECORD`, one at least."""
         self.latest = records[-1]
         self.timing.add(records)
         self.missed += int(records["missed"].sum())
@@ -77,17 +83,15 @@ class RunState:
         posed = records[records["status"] == 0]
         known = posed[np.isfinite(posed["truth"][:, 0])]
         errors = posed["lengths"] - posed["reference"][:, :, 0]
-        self._squares += (
-            np.sum((known["position"] - known["truth"][:, TRUTH_POSITION]) ** 2),
-            (np.sum(errors**2, axis=1) / np.count_nonzero(posed["lengths"], axis=1)).sum(),
-        )
-        if self.frames is not None and len(known):
-            tool = self.frames.tool.position
+        self._tracking_squares += float((np.sum(errors**2, axis=1) / np.count_nonzero(posed["lengths"], axis=1)).sum())
+        if len(known):
             rotations = rotations_from_quaternions(np.ascontiguousarray(known["truth"][:, TRUTH_QUATERNION]))
-            true = known["truth"][:, TRUTH_POSITION] + rotations @ tool
-            self._tool_squares += float(np.sum((known["position"] + known["rotation"] @ tool - true) ** 2))
+            off = pose_errors(known["position"], known["rotation"], known["truth"][:, TRUTH_POSITION], rotations)
+            self._squares += np.sum(off.reshape(-1, 2, 3) ** 2, axis=(0, 2))
+            if self.frames is not None:
+                arms = (known["rotation"] - rotations) @ self.frames.tool.position
+                self._tool_squares += float(np.sum((off[:, :3] + arms) ** 2))
         self._counts += (len(known), len(posed))
-        return True
 
     def level(self) -> dict[str, float] | None:
         """The greatest protection level of the motion, `position` [m] and `rotation` [rad]; None if there was none."""
@@ -98,6 +102,11 @@ class RunState:
         """RMS errors [m]: `estimation` of the position against the truth, over the `known` cycles that have a truth; `tracking`
         of a leg's length against the reference; with frames also `tool`, as `estimation`, of the tool's position.
         """
-        estimation, tracking = np.sqrt(self._squares / np.maximum(self._counts, 1)).tolist()
-        of_tool = {} if self.frames is None else {"tool": float(np.sqrt(self._tool_squares / max(self._counts[0], 1)))}
-        return {"estimation": estimation, "tracking": tracking, **of_tool, "known": int(self._counts[0])}
+        known, posed = np.maximum(self._counts, 1).tolist()
+        of_tool = {} if self.frames is None else {"tool": sqrt(self._tool_squares / known)}
+        tracking = sqrt(self._tracking_squares / posed)
+        return {"estimation": sqrt(self._squares[0] / known), "tracking": tracking, **of_tool, "known": int(self._counts[0])}
+
+    def rotation_errors(self) -> dict[str, float]:
+        """RMS error [rad]: `estimation` of the rotation against the truth, over the cycles that have one."""
+        return {"estimation": sqrt(self._squares[1] / max(self._counts[0], 1))}

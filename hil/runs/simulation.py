@@ -1,20 +1,24 @@
-"""A closed-loop simulation: a mechanism follows a target on its FMU plant, as fast as the machine can."""
+"""A closed-loop simulation: a mechanism follows a target on its FMU plant, as fast as the machine can, or step by step."""
 
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from controller.cycle import CycleStage
 from controller.direct_kinematics import poses_from_lengths
 from controller.frames import ActiveFrames, level_from_base
 from controller.planning.offline_planner import Reference
 from controller.planning.pace import least_time_scale
 from controller.planning.target import Target
 from controller.safety.causes import Cause
+from hil.loop.driver import FmuRig
+from hil.loop.own_stages import Cycle, Replacement, Stages, ordered, replace_command, replacements_of
 from hil.loop.records import COMPUTED
 from hil.progress import Progress, Say, no_progress, say_nothing
 from hil.realtime.durations import QUANTILES, percentiles
@@ -46,7 +50,7 @@ class SimulationStoppedError(GoughError, RuntimeError):
         self.result = result
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SimulationResult:
     """What a simulation found.
 
@@ -61,6 +65,7 @@ class SimulationResult:
         parameters: the constants of the cycle, for a recording.
         frames: of the target and of read-outs, if there are any.
         attitudes, heaves: (N, 3, 3) and (N, 3) [m], map {1} to the level frame, if the target stands in that or on it.
+        stages: module and name of the functions that stood in place of stages, by stage.
     """
 
     config: SimulationConfig
@@ -80,6 +85,14 @@ class SimulationResult:
     frames: ActiveFrames | None = None
     attitudes: Array | None = None
     heaves: Array | None = None
+    stages: dict[str, str] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        text = f"{self.mechanism.name} follows {self.target.name}: {len(self.times)} cycles at {self.config.rate:g} Hz"
+        if not self.moved:
+            return f"<{text}, before the motion>"
+        kind, what = ("estimation", "truth") if self.truth_known else ("estimated_tracking", "reference")
+        return f"<{text}, estimate - {what} {1e3 * self.summary()[kind]['position_rms']:.3f} mm RMS>"
 
     @property
     def moved(self) -> bool:
@@ -151,6 +164,7 @@ class SimulationResult:
             frames = {"frames": {**described, "protection": _protection(levels @ arm.T, of_tool)}}
         return {
             "truth_known": self.truth_known,
+            "motion_s": int(moving.sum()) / self.config.rate,
             **_errors(**of_platform),
             **frames,
             "protection": _protection(levels, of_platform),
@@ -160,6 +174,7 @@ class SimulationResult:
             "cycle_us": percentiles(self.records["stage_ns"][:, COMPUTED].sum(axis=1), tuple(QUANTILES)),
             "remarks": list(self.remarks),
             "events": self.events,
+            "stages": self.stages,
             "config": asdict(self.config),
             "version": version("gough"),
         }
@@ -171,6 +186,7 @@ def simulate(
     resumed: Snapshot | None = None,
     save_at: float | None = None,
     say: Say = say_nothing,
+    stages: Stages | None = None,
 ) -> SimulationResult:
     """Run a simulation.
 
@@ -180,16 +196,16 @@ def simulate(
         resumed: where to go on; the result then covers the rest of the run.
         save_at: the time in the motion at which to take a snapshot [s], its duration for the end; None for never.
         say: called with each remark before the loop runs.
+        stages: functions in place of stages of the cycle; some ten times slower than the compiled ones.
 
     Raises:
         GoughError: something in the configuration cannot be used; nothing has run.
-        SimulationStoppedError: the loop ended early.
+        SimulationStoppedError: the loop ended early; if a stage has failed, its exception is the cause of this one.
     """
-    if config.streamed or config.rig != "fmu":
-        raise InputError("a streamed target, and any rig but the FMU, has a clock of its own: use 'gough run'")
-    if config.fusion == "filterpy" and (resumed is not None or save_at is not None):
-        raise InputError("filters on filterpy cannot be saved: choose another fusion")
-    with prepared_loop(config) as loop:
+    stages = stages or Stages()
+    if (config.fusion == "filterpy" or stages.names) and (resumed is not None or save_at is not None):
+        raise InputError("filters on filterpy and stages of your own have a state that cannot be saved: leave them out")
+    with _loop_on_fmu(config, stages) as (loop, replacements):
         for remark in loop.remarks:
             say(remark)
         if resumed is not None:
@@ -197,18 +213,14 @@ def simulate(
         first, stop = int(loop.state["time"]["cycle"]), loop.state["safety"]["stop"]
         if save_at is not None:
             _check_time(save_at, loop, first)
-        snapshot = filters = None
-        if config.fusion == "filterpy":
-            from controller.estimation.filterpy_filters import FilterpyFilters
-
-            filters = FilterpyFilters(loop.parameters)
+        snapshot = None
         cause, took = Cause.NONE.value, loop.planning_time
         done, chunk = first, 1
         while cause == Cause.NONE and done < loop.cycle_at(config.duration):
             saved = None if save_at is None else loop.cycle_at(save_at)
             last = min(done + chunk, saved if saved is not None and done < saved else loop.cycle_at(config.duration))
             began = time.perf_counter()
-            cause = loop.run(last, filters)
+            cause = loop.run(last, replacements)
             passed = time.perf_counter() - began
             took, done = took + passed, last
             # As many cycles as fit, whatever a cycle costs on this plant.
@@ -216,12 +228,122 @@ def simulate(
             if cause == Cause.NONE and save_at is not None and last == loop.cycle_at(save_at) and stop["cause"] == Cause.NONE:
                 snapshot = take_snapshot(asdict(config), loop)
             progress(min((done - first) / (loop.cycle_at(config.duration) - first), 1.0))
-        result = _result(config, loop, first, snapshot, took)
+        result = _result(config, loop, first, snapshot, took, stages)
         if stop["cause"] != Cause.NONE:
-            how = "stopped on the brakes" if cause != Cause.NONE else "still stopping at the end, from"
-            count = loop.cycle_at(config.duration)
-            raise SimulationStoppedError(f"{how} at cycle {stop['cycle']} of {count}: {loop.reason()}", result)
+            raise _stopped(loop, result, cause) from loop.error
     return result
+
+
+class Simulation:
+    """A simulation that is stepped from outside, as `open_simulation` makes it.
+
+    Attributes:
+        cycle: what the loop knows, in views that change with it.
+    """
+
+    def __init__(self, config: SimulationConfig, loop: PreparedLoop, stages: Stages, replacements: list[Replacement]) -> None:
+        self._config, self._loop, self._stages, self._replacements = config, loop, stages, replacements
+        self._rig, self._began, self._cause, self._sensed = FmuRig(loop), time.perf_counter(), Cause.NONE.value, False
+        self.cycle: Cycle = loop.cycle
+
+    @property
+    def ended(self) -> bool:
+        """Whether the motion is over."""
+        return self.cycle.number >= self._loop.cycle_at(self._config.duration)
+
+    def sense(self) -> Cycle:
+        """Let the plant move for a period with the last command, read its sensors, and find the pose, the reference, and what
+        command gough would give. `act` ends the cycle.
+
+        Raises:
+            InputError: the motion is over, or the cycle before has not been ended.
+            SimulationStoppedError: the run has ended on the brakes.
+        """
+        if self._sensed:
+            raise InputError("the cycle has been sensed already: end it with act()")
+        if self.ended:
+            raise InputError(f"the motion of {self._config.duration:g} s is over: give the configuration a longer duration")
+        loop = self._loop
+        self._cause = loop.sense(self._rig)
+        if self._cause != Cause.NONE:
+            raise _stopped(loop, self.result(), self._cause) from loop.error
+        loop.compute(CycleStage.SCREENING, CycleStage.WATCH, self._replacements)
+        self._sensed = True
+        return self.cycle
+
+    def act(self, command: ArrayLike | None = None) -> None:
+        """End the cycle.
+
+        Args:
+            command: velocity of each drive (L,) [m/s] in place of gough's, cut off at the largest command. It counts while
+                `cycle.driving`.
+
+        Raises:
+            InputError: the command is malformed, or no cycle has been sensed.
+        """
+        if not self._sensed:
+            raise InputError("no cycle has been sensed: call sense() first")
+        if command is not None:
+            replace_command(self._loop.parameters, self._loop.state, self.cycle, command)
+        self._loop.finish(CycleStage.WATCH, self._replacements)
+        self._sensed = False
+
+    def step(self, command: ArrayLike | None = None) -> Cycle:
+        """One cycle: `sense`, then `act`."""
+        self.sense()
+        self.act(command)
+        return self.cycle
+
+    def result(self) -> SimulationResult:
+        """What was found until now."""
+        took = self._loop.planning_time + time.perf_counter() - self._began
+        return _result(self._config, self._loop, 0, None, took, self._stages)
+
+
+@contextmanager
+def open_simulation(config: SimulationConfig, stages: Stages | None = None) -> Iterator[Simulation]:
+    """A simulation to be stepped from outside, at rest before its first cycle.
+
+    Args:
+        config: what to simulate.
+        stages: functions in place of stages of the cycle.
+
+    Raises:
+        GoughError: something in the configuration cannot be used.
+    """
+    stages = stages or Stages()
+    with _loop_on_fmu(config, stages, stepped=True) as (loop, replacements):
+        yield Simulation(config, loop, stages, replacements)
+
+
+@contextmanager
+def _loop_on_fmu(
+    config: SimulationConfig, stages: Stages, stepped: bool = False
+) -> Iterator[tuple[PreparedLoop, list[Replacement]]]:
+    """A loop, and what runs in it in Python."""
+    if config.streamed or config.rig != "fmu":
+        raise InputError("a streamed target, and any rig but the FMU, has a clock of its own: use 'gough run'")
+    in_python = stepped or config.fusion == "filterpy" or bool(stages.names)
+    with prepared_loop(config, in_python=in_python) as loop:
+        if in_python:
+            FmuRig(loop).open()
+        replacements = replacements_of(stages, loop.cycle, loop.parameters, loop.state)
+        if config.fusion == "filterpy":
+            from controller.estimation.filterpy_filters import FilterpyFilters
+
+            filters, state = FilterpyFilters(loop.parameters), loop.state
+            replacements += [
+                Replacement(CycleStage.LEGS, CycleStage.LEGS, lambda: filters.step_legs(state)),
+                Replacement(CycleStage.PLATFORM, CycleStage.PLATFORM, lambda: filters.step_platform(state)),
+            ]
+        yield loop, ordered(replacements)
+
+
+def _stopped(loop: PreparedLoop, result: SimulationResult, cause: int) -> SimulationStoppedError:
+    how = "stopped on the brakes" if cause != Cause.NONE else "still stopping at the end, from"
+    reason = ": ".join(filter(None, [loop.reason(), loop.failure]))
+    at, count = int(loop.state["safety"]["stop"]["cycle"]), loop.cycle_at(result.config.duration)
+    return SimulationStoppedError(f"{how} at cycle {at} of {count}: {reason}", result)
 
 
 def _check_time(at: float, loop: PreparedLoop, first: int) -> None:
@@ -232,7 +354,7 @@ def _check_time(at: float, loop: PreparedLoop, first: int) -> None:
 
 
 def _result(
-    config: SimulationConfig, loop: PreparedLoop, first: int, snapshot: Snapshot | None, took: float
+    config: SimulationConfig, loop: PreparedLoop, first: int, snapshot: Snapshot | None, took: float, stages: Stages
 ) -> SimulationResult:
     done = int(loop.state["time"]["cycle"])
     records = loop.records[first:done]
@@ -248,6 +370,7 @@ def _result(
         config, loop.mechanism, loop.target, loop.reference, times, records,
         *poses_from_lengths(loop.mechanism, lengths, loop.target.start, partial=True), *target,
         (done - first) / config.rate / took, snapshot, loop.remarks, loop.parameters.copy(), loop.frames, attitudes, heaves,
+        stages.names,
     )  # fmt: skip
 
 

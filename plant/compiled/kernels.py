@@ -1,9 +1,11 @@
 """The one decorator that marks compiled kernels.
 
 numba notices no edit in the files of a kernel's callees. The machine code therefore lies in the user's cache under a hash of
-every source file of the three packages: any edit gives a new folder.
+every source file of the three packages: any edit gives a new folder. Copies of the same sources, such as a checkout and what
+was installed from it, share the machine code.
 """
 
+import hashlib
 import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -71,6 +73,43 @@ def _kernel_folder() -> Path:
     return keyed_folder("kernels", hash_of_files(sources, numba.__version__))
 
 
+@cache
+def _content(file: str) -> str:
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:20]
+
+
+class KernelLocator:
+    """Tells numba where a function's machine code lies: by its module's name and its file's content, wherever that file is.
+
+    numba's own hashes the file's path, and writes a file for each function to see whether that is possible.
+    """
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        self._folder = _kernel_folder() / f"{function.__module__}-{_content(file)}"
+        self._line = function.__code__.co_firstlineno
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> "KernelLocator":
+        """The locator of a function of a file."""
+        return cls(function, file)
+
+    def ensure_cache_path(self) -> None:
+        """Make the folder."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        """The folder."""
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        """The same at any time: an edit gives another folder."""
+        return ""
+
+    def get_disambiguator(self) -> str:
+        """The line, as functions of a file may have one name."""
+        return str(self._line)
+
+
 def kernel(function: F) -> F:
     """Mark a function as compiled code: off the GIL, never raising, its machine code cached.
 
@@ -107,12 +146,12 @@ def shared_kernel(function: F) -> F:
 def _cached(function: Callable[..., Any]) -> Any:
     """Numba's dispatcher, with the cache in our folder."""
     settings: Any = numba.config
-    before = settings.CACHE_DIR
-    settings.CACHE_DIR = str(_kernel_folder())
+    before = settings.CACHE_LOCATOR_CLASSES
+    settings.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__}"
     try:
         compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
     finally:
-        settings.CACHE_DIR = before
+        settings.CACHE_LOCATOR_CLASSES = before
     return compiled
 
 

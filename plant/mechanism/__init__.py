@@ -2,7 +2,7 @@
 
 from plant.mechanism.bodies import Bodies, Joints, Plate
 from plant.mechanism.checks import Limits
-from plant.mechanism.documents import load_in_space, load_mechanism, load_spatial, mechanism_text
+from plant.mechanism.documents import load_in_space, load_mechanism, load_spatial, mechanism_text, preset_names
 from plant.mechanism.planar import PlanarMechanism
 from plant.mechanism.spatial import LEGS, Mechanism, six_rows
 
@@ -18,5 +18,6 @@ __all__ = [
     "load_mechanism",
     "load_spatial",
     "mechanism_text",
+    "preset_names",
     "six_rows",
 ]

@@ -1,5 +1,6 @@
 """Mechanisms as TOML documents: presets and files, what they are based on, and their tables."""
 
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -29,20 +30,27 @@ _SAME_FRAMES = 1e-9
 """Largest difference in an entry of rotations that are the same."""
 
 
-def load_mechanism(name_or_path: str | Path) -> Mechanism | PlanarMechanism:
+def load_mechanism(name_or_path: str | Path, changes: Mapping[str, Any] | None = None) -> Mechanism | PlanarMechanism:
     """Load a preset by its name, or a mechanism from a TOML file; joints of two numbers make it a planar one.
 
+    Args:
+        name_or_path: of the preset or the file.
+        changes: entries that replace those of the file, by name with dots, such as {"control.proportional": 30.0}.
+
     Raises:
-        UnknownNameError: no such preset, and no such file.
+        UnknownNameError: no such preset, and no such file; or a change leads into something that is no table.
         InputError: the content is not a mechanism.
     """
-    return mechanism_from_text(mechanism_text(name_or_path), str(name_or_path))
+    return mechanism_from_text(mechanism_text(name_or_path), str(name_or_path), changes)
 
 
-def mechanism_from_text(text: str, source: str) -> Mechanism | PlanarMechanism:
-    """The mechanism of a TOML text, which messages call `source`; errors as for `load_mechanism`."""
+def mechanism_from_text(text: str, source: str, changes: Mapping[str, Any] | None = None) -> Mechanism | PlanarMechanism:
+    """The mechanism of a TOML text, which messages call `source`; changes and errors as for `load_mechanism`."""
     try:
-        return mechanism_from_document(mechanism_document(text, source))
+        document = mechanism_document(text, source)
+        for entry, value in (changes or {}).items():
+            set_entry(document, entry, value)
+        return mechanism_from_document(document)
     except (InputError, UnknownNameError) as error:
         raise type(error)(f"{source}: {error}") from None
 
@@ -73,11 +81,11 @@ def load_in_space(name_or_path: str | Path) -> Mechanism:
 
 def mechanism_text(name_or_path: str | Path) -> str:
     """The TOML text of a preset, or of a file; errors as for `load_mechanism`."""
-    if str(name_or_path) in _preset_names():
+    if str(name_or_path) in preset_names():
         return (_PRESETS / f"{name_or_path}.toml").read_text()
     path = Path(name_or_path)
     if not path.is_file():
-        names = _preset_names()
+        names = preset_names()
         raise UnknownNameError(
             f"no mechanism {str(path)!r}: neither a preset ({', '.join(names)}) nor a file{nearest(str(path), names)}"
         )
@@ -219,7 +227,8 @@ def _check_table(inner: Any, entry: str) -> None:
         raise UnknownNameError(f"the mechanism has no entry {entry}: {'.'.join(entry.split('.')[:-1])} is no table")
 
 
-def _preset_names() -> list[str]:
+def preset_names() -> list[str]:
+    """The names of all presets."""
     return sorted(entry.name.removesuffix(".toml") for entry in _PRESETS.iterdir() if entry.name.endswith(".toml"))
 
 
@@ -228,8 +237,8 @@ def _completed(document: dict[str, Any], source: str) -> dict[str, Any]:
     names = [source]
     while "based_on" in document:
         names.append(document.pop("based_on"))
-        if names[-1] not in _preset_names():
-            presets = _preset_names()
+        if names[-1] not in preset_names():
+            presets = preset_names()
             question = nearest(str(names[-1]), presets)
             raise UnknownNameError(f"based_on names no preset: {names[-1]!r}; there are {', '.join(presets)}{question}")
         if names[-1] in names[:-1]:

@@ -712,13 +712,14 @@ def test_every_stage_that_runs_is_timed_and_no_other(hexapod):
         (stages.LEGS, stages.POSE, [1, 3]),
         (stages.POSE, stages.REFINEMENT, [4]),
         (stages.REFINEMENT, stages.CONTROL, [5, 6, 7]),
-        (stages.CONTROL, stages.END, [8]),
+        (stages.CONTROL, stages.WATCH, [8]),
+        (stages.WATCH, stages.END, [9]),
     ):
         marks["ns"] = -1
         assert state["time"]["cycle"] == 0
         compiled.run_stages(parameters, state, signals, resting(np.full(6, 0.394)), marks, int(first), int(last))
         assert np.flatnonzero(marks["ns"] >= 0).tolist() == timed
-    # After the control, the cycle is over.
+    # After the last stage, the cycle is over.
     assert state["time"]["cycle"] == 1
 
 

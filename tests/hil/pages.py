@@ -38,7 +38,7 @@ def dumped(page, profile):
         pytest.skip("no browser here")
     flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-component-update"
     run = subprocess.run(
-        [browser, *flags.split(), "--virtual-time-budget=10000", f"--user-data-dir={profile}", "--dump-dom", f"file://{page}"],
+        [browser, *flags.split(), "--virtual-time-budget=3000", f"--user-data-dir={profile}", "--dump-dom", f"file://{page}"],
         capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip
     return run.stdout, run.stderr

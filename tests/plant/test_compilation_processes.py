@@ -71,7 +71,7 @@ def kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleT
     module = import_module(name)
     yield module
     del sys.modules[name]
-    shutil.rmtree(module.first._cache.cache_path)
+    shutil.rmtree(module.first._cache.cache_path, ignore_errors=True)
 
 
 def records(kernels: ModuleType) -> Any:

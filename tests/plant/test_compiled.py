@@ -192,25 +192,27 @@ def test_a_cache_that_cannot_be_written_gives_way_to_temporary_files(monkeypatch
 
 
 def test_machine_code_is_kept_in_the_cache_alone(tmp_path: Path) -> None:
-    """A fresh process compiles into the cache folder, and the next one compiles nothing."""
+    """A fresh process compiles into the cache folder; the next one compiles nothing, nor does one on a copy of the sources."""
     code = (
         "import numpy as np; from plant.pose import rotation_from_quaternion as r; r(np.array([1.0, 0.0, 0.0, 0.0]));"
         "print(sum(r.stats.cache_hits.values()), sum(r.stats.cache_misses.values()))"
     )
     package = Path(__file__).resolve().parents[2] / "plant"
     before = sorted(package.rglob("*.nb?"))
+    for each in PACKAGES:
+        shutil.copytree(package.parent / each, tmp_path / "copy" / each, ignore=shutil.ignore_patterns("__pycache__"))
     said = [
         subprocess.run(
             [sys.executable, "-c", code],
             env=os.environ | {"GOUGH_CACHE": str(tmp_path)},
-            cwd=package.parent,
+            cwd=folder,
             check=True,
             capture_output=True,
             text=True,
         ).stdout.split()
-        for _ in range(2)
+        for folder in (package.parent, package.parent, tmp_path / "copy")
     ]
-    assert said == [["0", "1"], ["1", "0"]]
+    assert said == [["0", "1"], ["1", "0"], ["1", "0"]]
     assert len(list((tmp_path / "kernels").iterdir())) == 1
     assert list((tmp_path / "kernels").rglob("*.nbc"))
     assert sorted(package.rglob("*.nb?")) == before

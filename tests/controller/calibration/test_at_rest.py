@@ -120,7 +120,7 @@ def test_the_mounting_of_the_magnetometers_is_undone_as_that_of_the_acceleromete
     assert not offset[2].any()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_an_imu_on_the_base_errs_less_on_a_tilted_base_once_its_share_of_each_error_is_known(hexapod, seed):
     random, prior = np.random.default_rng(seed), Prior(accelerometer_bias=0.1, alignment=np.radians(1.0))
     level = -hexapod.plant["gravity"]

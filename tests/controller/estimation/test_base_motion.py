@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from controller.estimation import base_motion
 from controller.estimation.base_motion import base_motion_parameters, follow_base, heave
@@ -42,20 +43,26 @@ class Sea:
         self.phases = random.uniform(0.0, 2.0 * np.pi, 6)
         self.arm = np.array(arm)
 
-    def attitude(self, t):
-        return rotation_from_vector((self.sizes * np.sin(self.rates * t + self.phases))[:3])
+    def moved(self, times):
+        return self.sizes * np.sin(self.rates * times[:, None] + self.phases)
 
-    def place(self, t):
-        return (self.sizes * np.sin(self.rates * t + self.phases))[3:]
+    def attitudes(self, times):
+        return Rotation.from_rotvec(self.moved(times)[:, :3]).as_matrix()
 
-    def reading(self, t):
-        """Rate, angular acceleration and specific force (3, 3), seen in {1}, by differences of attitude and place."""
+    def places(self, times):
+        return self.moved(times)[:, 3:]
+
+    def readings(self, times):
+        """Rate, angular acceleration and specific force (N, 3, 3), seen in {1}, by differences of attitude and place."""
         h = 1e-3
-        before, now, after = (self.attitude(t + k * h) for k in (-1, 0, 1))
-        ahead, behind = vector_from_rotation(now.T @ after) / h, vector_from_rotation(before.T @ now) / h
-        at = [self.place(t + k * h) + self.attitude(t + k * h) @ self.arm for k in (-1, 0, 1)]
-        acceleration = (at[2] - 2.0 * at[1] + at[0]) / h**2
-        return np.array([0.5 * (ahead + behind), (ahead - behind) / h, now.T @ (acceleration + GRAVITY * UP)])
+        before, now, after = (self.attitudes(times + k * h) for k in (-1, 0, 1))
+        to_base = np.swapaxes(now, 1, 2)
+        ahead, behind = (
+            Rotation.from_matrix(turn).as_rotvec() / h for turn in (to_base @ after, np.swapaxes(before, 1, 2) @ now)
+        )
+        at = [self.places(times + k * h) + attitude @ self.arm for k, attitude in ((-1, before), (0, now), (1, after))]
+        force = (at[2] - 2.0 * at[1] + at[0]) / h**2 + GRAVITY * UP
+        return np.stack([0.5 * (ahead + behind), (ahead - behind) / h, (to_base @ force[:, :, None])[:, :, 0]], axis=1)
 
 
 def follow(p, s, reading):
@@ -64,20 +71,18 @@ def follow(p, s, reading):
 
 def sail(p, sea, duration, bias=(0.0, 0.0, 0.0), noise=None):
     """Attitudes of the base against the truth (N, 3) [rad], and heaves (N, 3) beside the true ones (N,) [m]."""
-    s, off, heaves, true = fresh(), [], [], []
-    random = np.random.default_rng(7)
-    for n in range(round(duration / PERIOD)):
-        t = n * PERIOD
-        reading = sea.reading(t)
-        reading[0] += bias
-        if noise is not None:
-            reading[0] += noise[0] / np.sqrt(PERIOD) * random.normal(size=3)
-            reading[2] += noise[1] / np.sqrt(PERIOD) * random.normal(size=3)
+    s, times = fresh(), PERIOD * np.arange(round(duration / PERIOD))
+    readings = sea.readings(times)
+    readings[:, 0] += bias
+    if noise is not None:
+        random = np.random.default_rng(7).normal(size=(len(times), 2, 3))
+        readings[:, ::2] += np.array(noise)[:, None] / np.sqrt(PERIOD) * random
+    attitudes, heaves = np.empty((len(times), 3, 3)), np.empty((len(times), 3))
+    for n, reading in enumerate(readings):
         follow(p, s, reading)
-        off.append(vector_from_rotation(s["attitude"] @ sea.attitude(t).T))
-        heaves.append(heave(p, s))
-        true.append(sea.place(t)[2])
-    return np.array(off), np.array(heaves), np.array(true), s
+        attitudes[n], heaves[n] = s["attitude"], heave(p, s)
+    off = Rotation.from_matrix(attitudes @ np.swapaxes(sea.attitudes(times), 1, 2)).as_rotvec()
+    return off, heaves, sea.places(times)[:, 2], s
 
 
 def twin(p, readings):
@@ -117,7 +122,7 @@ def twin(p, readings):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_filters_agree_with_filters_of_matrices(mechanism, seed):
     p, sea = parameters_of(mechanism, 7.0), Sea(seed, moves=(0.1, 0.1, 0.05))
-    readings = np.array([sea.reading(n * PERIOD) for n in range(1500)]) + [[0.002], [0.0], [0.0]]
+    readings = sea.readings(PERIOD * np.arange(1500)) + [[0.002], [0.0], [0.0]]
     s = fresh()
     for reading in readings:
         follow(p, s, reading)

@@ -156,7 +156,7 @@ def check_random_motion(mechanism, seed):
     return True
 
 
-@pytest.mark.parametrize("first", range(0, 100, 20))
+@pytest.mark.parametrize("first", [0, *(pytest.param(first, marks=pytest.mark.slow) for first in range(20, 100, 20))])
 def test_random_motions_leave_no_limit(hexapod, first):
     assert sum(check_random_motion(hexapod, seed) for seed in range(first, first + 20)) >= 14
 
@@ -459,7 +459,7 @@ def check_time_scale(mechanism, seed):
     return True
 
 
-@pytest.mark.parametrize("first", range(0, 40, 10))
+@pytest.mark.parametrize("first", [0, *(pytest.param(first, marks=pytest.mark.slow) for first in range(10, 40, 10))])
 def test_the_time_scale_that_would_pass_passes(hexapod, first):
     assert sum(check_time_scale(hexapod, seed) for seed in range(first, first + 10)) >= 7
 

@@ -109,6 +109,7 @@ RUN = {
     "timing_us": {"wake": FIGURES_US, "round trip": {"p50": 11.0, "p99": 12.0, "p999": 13.0, "max": 14.0, "n": 9}},
     "over_budget": [],
     "errors_m": {"estimation": 0.25e-3, "tracking": 0.5e-3, "known": 1},
+    "errors_rad": {"estimation": 0.002},
     "usage": {"major_faults": 4, "minor_faults": 5, "involuntary_switches": 6, "resident": 7},
     "start_up_s": 1.25,
     "unseen": 0,
@@ -142,7 +143,7 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
         "1200 cycles; periods missed: 1 by own work, 2 woken late, 3 held up by the host",
         "the loop's thread: 4 major and 5 minor page faults, 6 involuntary switches, 7 bytes of growth; first cycle 1.25 s "
         "after the start",
-        "estimate - truth 0.250 mm RMS; reference - length 0.500 mm RMS",
+        "estimate - truth 0.250 mm, 0.115 deg RMS; reference - length 0.500 mm RMS",
         "round trip to the rig p50 11, p99 12, p99.9 13, max 14 us",
         "8 exchanges late, 9 packets refused",
         "1000 cycles recorded in a.mcap, b.mcap; 200 cycles lost",

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hil.engine.batches import Failure
@@ -64,6 +64,7 @@ def test_results_come_in_the_order_of_the_items_whatever_their_times(engine):
     assert engine.map(late, []) == []
 
 
+@settings(max_examples=20)
 @given(items=st.lists(st.floats() | st.text() | st.tuples(st.integers(), st.booleans()), max_size=10))
 def test_every_item_has_one_result_in_its_place(engine, items):
     assert engine.map(repr, items) == list(map(repr, items))
@@ -136,11 +137,11 @@ def test_workers_are_other_processes_and_their_page_is_named(two):
 
 def test_without_dask_all_is_done_here_unless_more_is_asked_for(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    for settings in (None, EngineSettings(), EngineSettings(workers=1)):
-        with open_engine(settings) as engine:
+    for chosen in (None, EngineSettings(), EngineSettings(workers=1)):
+        with open_engine(chosen) as engine:
             assert engine.map(late, [0.0]) == [(0.0, os.getpid())]
-    for settings in (TWO, NOBODY):
-        with pytest.raises(MissingPackageError, match=r"this needs distributed.*gough\[sweep\]"), open_engine(settings):
+    for chosen in (TWO, NOBODY):
+        with pytest.raises(MissingPackageError, match=r"this needs distributed.*gough\[sweep\]"), open_engine(chosen):
             pass
 
 

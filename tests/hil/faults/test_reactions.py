@@ -17,13 +17,14 @@ def run_matrix(seeds, cases):
     return outcomes_of(cases, run_trials(trials_of(cases, seeds)))
 
 
-@pytest.mark.parametrize("seeds", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
-def test_the_reaction_is_the_specified_one(case, seeds):
-    (outcome,) = run_matrix(seeds, (case,))
+def test_the_reaction_is_the_specified_one(case, seed):
+    (trial,) = (each for each in trials_of((case,), seed + 1) if each.seed == seed)
+    (outcome,) = outcomes_of((case,), run_trials([trial]))
     assert outcome.findings == []
-    assert sum(outcome.reactions.values()) == seeds
-    assert len(outcome.cycles) == (seeds if case.expected else 0)
+    assert sum(outcome.reactions.values()) == 1
+    assert len(outcome.cycles) == (1 if case.expected else 0)
 
 
 ENCODERS = with_encoders(CASES, "incremental")

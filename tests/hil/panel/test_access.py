@@ -10,14 +10,23 @@ viser = pytest.importorskip("viser")
 
 from websockets.datastructures import Headers  # noqa: E402
 
-from controller.frames import ActiveFrames, Frames  # noqa: E402
+from controller.frames import ActiveFrames, Frames, parse_frames  # noqa: E402
+from controller.workspace import Demands  # noqa: E402
 from hil.command_line import main  # noqa: E402
 from hil.loop.records import RECORD  # noqa: E402
 from hil.panel.access import Gate, close_server, open_server, panel_address  # noqa: E402
-from hil.panel.readings import error_line, leg_table, pose_table, status  # noqa: E402
+from hil.panel.margins import margin_table  # noqa: E402
+from hil.panel.readings import error_line, frames_to_choose, leg_table, pose_table, status  # noqa: E402
 from hil.panel.scene import Machine, leg_colors  # noqa: E402
-from hil.runs.telemetry import machine_message, state_message, timing_message  # noqa: E402
+from hil.runs.telemetry import (  # noqa: E402
+    frames_message,
+    machine_message,
+    margins_message,
+    state_message,
+    timing_message,
+)
 from plant.errors import InputError  # noqa: E402
+from plant.pose import Pose  # noqa: E402
 
 TOKEN = "0123456789abcdef0123"
 
@@ -104,7 +113,6 @@ def test_an_address_that_is_taken_is_refused(server):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["--at", "127.0.0.1:1", "--listen", "127.0.0.1:8767"], "no run answers at 127.0.0.1:1"),
         (["nothing.mcap"], "nothing.mcap"),
         (["run.mcap", "--start", "--imu", "ideal"], "play a recording, or start a run with --start, and not both"),
         (["--listen", "192.168.1.1:80"], "--page-token-file"),
@@ -141,7 +149,7 @@ def test_a_record_becomes_a_state_and_words(hexapod, machine):
     frames = ActiveFrames(Frames())
     state = state_message(record, frames)
     assert state["imus"] == [0, 1, 2, 3, 4, 6] and "truth" not in state
-    assert "| estimate | 1.00 | -2.00 | 350.00 | 0.000 | 0.000 | 0.000 |" in pose_table(state, frames.described())
+    assert "| estimate | 1.00 | -2.00 | 350.00 | 0.000 | 0.000 | 0.000 |" in pose_table(state)
     assert "protection level 1.50 mm, inf deg" in error_line(state)
     rows = leg_table(state, machine).splitlines()
     assert rows[7].endswith("| **out** |") and rows[2].endswith("| used |")
@@ -151,4 +159,31 @@ def test_a_record_becomes_a_state_and_words(hexapod, machine):
     assert timing_message(records, np.arange(0), 1e-3) == {}
     record["position"] = np.nan
     assert "pose" not in state_message(record, frames)
-    assert pose_table(state_message(record, frames), frames.described()) == "no pose"
+    assert pose_table(state_message(record, frames)) == "no pose"
+
+
+def test_poses_are_told_in_any_frame_of_the_run_on_the_base(hexapod):
+    text = "work = 'table'\ntool = 'tip'\n[frames.table]\nparent = 'base'\nposition = [0.0, 0.0, 0.3]\n"
+    text += "[frames.tip]\nparent = 'platform'\nposition = [0.0, 0.0, 0.1]\n[frames.sea]\nparent = 'level'\n"
+    frames = parse_frames(text, "here").active()
+    choices = frames_to_choose(frames_message(frames))
+    assert list(choices) == ["tip in table", "platform in table", "tip in base", "platform in base"]
+    state = {"pose": {"position": [0.01, 0.0, 0.35], "rotation": [0.0, 0.0, 0.1]}}
+    assert "| estimate | 10.00 | 0.00 | 150.00 | 0.000 | 0.000 | 5.730 |" in pose_table(state, choices["tip in table"])
+    assert "| estimate | 10.00 | 0.00 | 50.00 |" in pose_table(state, choices["platform in table"])
+    assert "| estimate | 10.00 | 0.00 | 350.00 |" in pose_table(state, choices["platform in base"])
+    assert list(frames_to_choose(frames_message(ActiveFrames(Frames())))) == ["platform in base"]
+
+
+def test_margins_of_all_limits_come_the_closest_first(hexapod):
+    stroke = hexapod.limits.stroke[:, 1].max()
+    high = Pose(hexapod.home.position + [0.0, 0.0, 0.06], hexapod.home.rotation)
+    told = margins_message(hexapod, high, Demands())
+    assert told[0]["kind"] == "stroke" and 0.0 < told[0]["share"] < 0.2 and told[0]["bound"] == pytest.approx(stroke)
+    assert [each["share"] for each in told] == sorted(each["share"] for each in told)
+    assert {each["kind"] for each in told} >= {"stroke", "force", "Jacobian", "direct kinematics"}
+    rows = margin_table(told).splitlines()
+    assert rows[2].startswith("| stroke of leg ") and f"| {1e3 * stroke:.4g} mm |" in rows[2] and len(rows) == 2 + len(told)
+    assert margin_table([]) == "no pose"
+    beyond = Pose(hexapod.home.position + [0.0, 0.0, 0.08], hexapod.home.rotation)
+    assert "| **-" in margin_table(margins_message(hexapod, beyond, Demands()))

@@ -196,6 +196,47 @@ def test_a_recording_of_a_planar_mechanism_plays(chromium, tmp_path):
     play(chromium, recording, tmp_path)
 
 
+def test_a_page_without_a_run_starts_one_after_the_other(chromium, tmp_path):
+    """A run that nobody moves is shown and can be ended; the next one is planar, and is moved."""
+    address = f"127.0.0.1:{free_port()}"
+
+    def running():
+        try:
+            return state_of(address)["mode"] == "running"
+        except ChannelError:
+            return False
+
+    with panel("--at", address) as page_address, opened(chromium, page_address) as page:
+        page.get_by_text(f"answers at {address}").wait_for()
+        choose(page, "Target", "circle")
+        press(page, "Start the run")
+        waited(running, 300.0)
+        page.get_by_text("hexapod follows circle").wait_for()
+        assert waited(lambda: drawn(page, tmp_path) > 100)
+        assert not page.get_by_role("button", name="Take control", exact=True).is_visible()
+        page.get_by_role("tab", name="Limits").click()
+        page.get_by_role("cell", name="conditioning of the Jacobian").wait_for()
+        press(page, "Controlled stop")
+        page.get_by_text("The run has ended").wait_for()
+        choose(page, "Mechanism", "planar-3rpr")
+        choose(page, "IMUs", "ideal")
+        press(page, "Start the run")
+        waited(running, 300.0)
+        begin = state_of(address)["truth"]["position"]
+        take_control(page)
+        press(page, "Go on")
+        page.get_by_text("no move has been paused").wait_for()
+        press(page, "Step +")
+        waited(lambda: rests_at(address, begin, [1e-3, 0.0, 0.0]))
+        assert page.locator("label", has_text="z [mm]").count() == 0
+    waited(lambda: not running())
+
+
+def choose(page, label, name):
+    page.get_by_label(label, exact=True).click()
+    page.get_by_role("option", name=name, exact=True).click()
+
+
 def take_control(page, number=0):
     page.get_by_text("running", exact=True).wait_for()
     press(page, "Take control")

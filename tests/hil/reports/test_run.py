@@ -1,11 +1,13 @@
 """The report of a simulation: what a browser would draw is read back from the file."""
 
+import json
 import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from hil.look import REFERENCE_COLOR, TRUTH_COLOR
 from hil.reports.run import write_report
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
@@ -129,18 +131,62 @@ def test_the_errors_are_estimate_less_truth_and_truth_less_reference(traces, res
                 assert value == pytest.approx(unit * error[part + i], rel=1e-5, abs=1e-6)
 
 
-def test_the_mechanism_moves_on_legs_of_the_true_length(page, traces, result):
-    frames = json_after(page, "Plotly.addFrames('mechanism',")
+@pytest.fixture(scope="module")
+def frames(page):
+    return json_after(page, "Plotly.addFrames('mechanism',")
+
+
+def moments_of(result, frames):
+    return np.linspace(np.argmax(result.times >= 0.0), len(result.times) - 1, len(frames)).astype(int)
+
+
+def test_the_mechanism_moves_on_legs_of_the_estimated_length(traces, result, frames):
     assert 20 <= len(frames) <= 150
-    moments = np.linspace(np.argmax(result.times >= 0.0), len(result.times) - 1, len(frames)).astype(int)
-    for number, (frame, moment) in enumerate(zip(frames, moments, strict=True)):
+    for number, (frame, moment) in enumerate(zip(frames, moments_of(result, frames), strict=True)):
         assert frame["name"] == str(number)
         assert [part["type"] for part in frame["data"]] == [traces["mechanism"][k]["type"] for k in frame["traces"]]
         tubes, rods = points(frame["data"][2]), points(frame["data"][3])
         np.testing.assert_allclose(tubes[0::3], 1e3 * result.mechanism.base_joints, atol=1e-4)
         np.testing.assert_array_equal(tubes[1::3], rods[0::3])
         lengths = np.linalg.norm(rods[1::3] - tubes[0::3], axis=1)
-        np.testing.assert_allclose(lengths, 1e3 * result.records["truth"][moment, TRUTH_LENGTHS], atol=1e-2)
+        np.testing.assert_allclose(lengths, 1e3 * result.records["lengths"][moment], atol=1e-2)
+
+
+def test_the_ghosts_are_the_reference_in_blue_and_the_truth_in_red(traces, result, frames):
+    poses = {
+        REFERENCE_COLOR: (result.reference_positions, result.reference_rotations),
+        TRUTH_COLOR: (result.true_positions, result.true_rotations),
+    }
+    for frame, moment in zip(frames, moments_of(result, frames), strict=True):
+        for number, (color, (positions, rotations)) in zip((5, 6), poses.items(), strict=True):
+            assert traces["mechanism"][number]["line"]["color"] == color
+            joints = 1e3 * (positions[moment] + result.mechanism.platform_joints @ rotations[moment].T)
+            rim = points(frame["data"][number])
+            assert len(rim) == 7
+            assert all(np.abs(rim - joint).max(axis=1).min() < 1e-2 for joint in joints)
+
+
+def test_the_legs_are_coloured_by_what_the_menu_names(page, traces, result, frames):
+    tubes = [2, 7, 8]
+    limits = result.mechanism.require_limits()
+    for frame, moment in zip(frames, moments_of(result, frames), strict=True):
+        record = result.records[moment]
+        expected = (
+            np.abs(2.0 * (record["lengths"] - limits.stroke[:, 0]) / np.ptp(limits.stroke, axis=1) - 1.0),
+            np.abs(record["reference"][:, 1]) / limits.velocity,
+            np.zeros(6),
+        )
+        for number, shares in zip(tubes, expected, strict=True):
+            drawn = numbers(frame["data"][number]["line"]["color"])
+            np.testing.assert_allclose(drawn, np.repeat(shares, 3), atol=1e-3)
+            np.testing.assert_array_equal(points(frame["data"][number]), points(frame["data"][2]))
+    assert [traces["mechanism"][number].get("visible", True) for number in tubes] == [True, False, False]
+    buttons = {}
+    for label, number in zip(("stroke", "speed", "IMUs"), tubes, strict=True):
+        start = page.index(f'"label":"legs by {label}"')
+        (text,) = re.findall(r'"args":(\[.*?\]\}?,\[[\d,]+\]\])', page[start - 200 : start + 20])[-1:]
+        buttons[label] = json.loads(text)
+        assert buttons[label] == [{"visible": [each == number for each in tubes]}, tubes]
 
 
 def test_a_browser_draws_every_figure_without_an_error(report):

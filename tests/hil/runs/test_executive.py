@@ -29,6 +29,7 @@ from hil.runs.executive import RunStoppedError, run
 from hil.runs.prepare import prepared_loop
 from plant.errors import GoughError, InputError
 from plant.mechanism import load_mechanism
+from tests.hil.runs.test_hardware_in_the_loop import free_port
 
 ROOT = os.geteuid() == 0
 CONFIG = SimulationConfig(target="sines", duration=1.0, rate=500.0)
@@ -75,19 +76,20 @@ def is_ours(pid):
     return False
 
 
-def wait_for(condition, seconds=60.0):
+def wait_for(condition, seconds=60.0, pause=0.02):
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "it takes too long"
-        time.sleep(0.02)
+        time.sleep(pause)
 
 
 def started(path, *options, **environment):
     """A run in a process of its own that is well under way: that, and the loop's and the recorder's process."""
     process = gough("run", "--duration", 60, "--rate", 500, "--most-missed", 2000, "--record", path, *options, **environment)
-    wait_for(lambda: recorded_cycles(path) > 300 or process.poll() is not None)
+    wait_for(lambda: recorded_cycles(path) > 300 or process.poll() is not None, pause=0.1)
     assert process.poll() is None, process.communicate()
-    loop, recorder = children(process.pid)
+    # The channel comes before them, if its address is free.
+    loop, recorder = children(process.pid)[-2:]
     return process, loop, recorder
 
 
@@ -156,7 +158,7 @@ def test_a_replay_is_the_run_bit_for_bit(recorded):
     assert process.returncode == 0
 
 
-@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+@pytest.mark.parametrize("fusion", [pytest.param("compiled", marks=pytest.mark.slow), "whole"])
 def test_a_replay_has_the_added_sensors(fusion, tmp_path):
     """Lengths and the base's IMU are as much part of a recording as the other IMUs."""
     added = ["--lengths", "incremental", "--base-imu", "--fault", "base-tilt,axis=x,size_deg=3,sine_hz=0.2,at=0.1"]
@@ -313,7 +315,7 @@ def test_an_emergency_stop_is_heard_by_a_run_that_was_told_to_ignore_it(tmp_path
     for pid in (process.pid, *others):
         os.kill(pid, signal.SIGINT)
     cycles = recorded_cycles(path)
-    wait_for(lambda: recorded_cycles(path) > cycles + 300 or process.poll() is not None)
+    wait_for(lambda: recorded_cycles(path) > cycles + 300 or process.poll() is not None, pause=0.1)
     process.send_signal(signal.SIGQUIT)
     _, errors = process.communicate(timeout=30.0)
     said = errors.splitlines()[0]
@@ -359,7 +361,7 @@ def test_when_the_recorder_is_killed_another_goes_on_and_no_cycle_is_lost_or_dou
     process, loop, recorder = started(path)
     os.kill(recorder, signal.SIGKILL)
     second = tmp_path / "run-2.mcap"
-    wait_for(lambda: recorded_cycles(second) > 300)
+    wait_for(lambda: recorded_cycles(second) > 300, pause=0.1)
     assert Path(f"/proc/{loop}").exists()
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=30.0)
@@ -392,7 +394,7 @@ def test_a_recording_that_is_spoiled_while_it_goes_on_is_noticed_and_the_rest_is
     process, *_ = started(path, "--json", figures)
     spoil(path)
     left = path.read_bytes() if path.exists() else None
-    wait_for(lambda: recorded_cycles(second) > 300 or process.poll() is not None)
+    wait_for(lambda: recorded_cycles(second) > 300 or process.poll() is not None, pause=0.1)
     process.send_signal(signal.SIGTERM)
     output, errors = process.communicate(timeout=30.0)
     assert process.returncode == 0, errors
@@ -576,8 +578,9 @@ def gone(*pids):
 
 @pytest.mark.slow
 def test_when_the_supervisor_is_killed_before_the_start_nothing_stays(tmp_path):
-    process = gough("run", "--duration", 60, "--rate", 500, "--record", tmp_path / "run.mcap")
-    wait_for(lambda: children(process.pid) or process.poll() is not None)
+    channel = f"127.0.0.1:{free_port()}"
+    process = gough("run", "--duration", 60, "--rate", 500, "--record", tmp_path / "run.mcap", "--channel", channel)
+    wait_for(lambda: len(children(process.pid)) > 1 or process.poll() is not None)
     others = children(process.pid)
     process.kill()
     process.communicate()
@@ -597,7 +600,7 @@ def test_a_recorder_killed_at_once_costs_nothing(tmp_path):
     path, figures = tmp_path / "run.mcap", tmp_path / "run.json"
     process = gough("run", "--duration", 1.5, "--rate", 500, "--most-missed", 2000, "--record", path, "--json", figures)
     wait_for(lambda: path.exists() and path.stat().st_size)
-    os.kill(children(process.pid)[1], signal.SIGKILL)
+    os.kill(children(process.pid)[-1], signal.SIGKILL)
     _, errors = process.communicate(timeout=60.0)
     assert process.returncode == 0, errors
     summary = json.loads(figures.read_text())

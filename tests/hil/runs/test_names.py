@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from controller.calibration.file import Calibration, load_calibration
+from controller.frames import Frame, Frames
 from controller.planning.target import Target, load_target
 from hil.rigs.template import TemplateRig
 from hil.runs import prepare
@@ -266,3 +267,50 @@ def test_a_mechanism_made_by_a_program_runs(hexapod):
     config = SimulationConfig(made, spiral(made), 0.3, imu="ideal")
     assert Path(config.mechanism).name == "_by_hand.toml"
     assert simulate(config).summary()["tracking"]["position_rms"] < 1e-3
+
+
+def nod(t):
+    """A bow about y, and a rise, from rest."""
+    s = 10.0 * t**3 - 15.0 * t**4 + 6.0 * t**5 if t < 1.0 else 1.0
+    return [0.0, 0.0, 0.01 * s, 0.0, 0.05 * s, 0.0]
+
+
+def test_a_function_of_time_is_a_target():
+    config = SimulationConfig(target=nod, duration=1.0, imu="ideal", rate=250.0)
+    assert Path(config.target).name == "nod.csv"
+    result = simulate(config)
+    expected = np.array([nod(max(0.0, t)) for t in result.times])
+    home = result.mechanism.home
+    np.testing.assert_allclose(result.target_positions - home.position, expected[:, :3], rtol=0.0, atol=1e-6)
+    assert result.summary()["target"]["position_rms"] < 2e-4
+    end = rotation_from_vector(expected[-1, 3:]) @ home.rotation
+    np.testing.assert_allclose(result.target_rotations[-1], end, rtol=0.0, atol=1e-6)
+
+
+def test_a_function_of_time_is_slowed_down_as_a_file_is():
+    fast, slow = (
+        SimulationConfig(target=nod, duration=duration, time_scale=scale) for duration, scale in ((1.0, 1.0), (2.0, 2.0))
+    )
+    assert fast.target == slow.target
+
+
+def test_a_function_of_time_has_the_poses_of_the_tool_with_frames():
+    frames = Frames({"cell": Frame("base", np.array([0.02, 0.0, 0.3]))}, work="cell")
+    config = SimulationConfig(target=lambda t: [-0.02, 0.0, 0.065, 0.0, 0.0, 0.0], frames=frames, duration=0.1)
+    target = load_target(config.target, load_in_space("hexapod"), 0.1, config.active_frames)
+    np.testing.assert_allclose(target.positions, np.tile([0.0, 0.0, 0.365], (len(target.times), 1)), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("function", "said"),
+    [
+        (lambda t: [0.0] * 5, r"<lambda>\(0\) must have shape \(6,\), got \(5,\)"),
+        (lambda t: [0.0] * 5 + [np.nan if t > 0.5 else 0.0], r"<lambda>\(0.51\)\[5\] is nan"),
+        (lambda t: None, "array of numbers"),
+    ],
+)
+def test_a_function_that_gives_no_pose_is_refused(function, said):
+    with pytest.raises(InputError, match=said):
+        SimulationConfig(target=function)
+    with pytest.raises(InputError, match="duration"):
+        SimulationConfig(target=nod, duration=np.inf)

@@ -29,6 +29,20 @@ def command(*arguments, **options):
     return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
+def ready(run, address):
+    """Wait until a run follows its target."""
+    until = time.monotonic() + 600.0
+    while True:
+        assert run.poll() is None and time.monotonic() < until, run.communicate()
+        try:
+            with Operator(address, role="observer", patience=60.0) as observer:
+                if observer.ask("state")["telemetry"]["mode"] == "running":
+                    return
+        except ChannelError:
+            pass
+        time.sleep(0.2)
+
+
 @contextmanager
 def operated(folder, *options):
     """A run that is ready for its operator: its process, and the address of its channel."""
@@ -38,16 +52,7 @@ def operated(folder, *options):
         "--record", folder / "run.mcap", "--json", folder / "run.json", *options,
     )  # fmt: skip
     try:
-        until = time.monotonic() + 600.0
-        while True:
-            assert run.poll() is None and time.monotonic() < until, run.communicate()
-            try:
-                with Operator(address, role="observer", patience=60.0) as observer:
-                    if observer.ask("state")["telemetry"]["time"] > 0.0:
-                        break
-            except ChannelError:
-                pass
-            time.sleep(0.2)
+        ready(run, address)
         yield run, address
     finally:
         run.kill()

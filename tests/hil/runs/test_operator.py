@@ -14,18 +14,20 @@ import pytest
 from controller.frames import ActiveFrames, Frames
 from controller.frames.tree import Frame
 from controller.inverse_kinematics import leg_lengths
-from controller.planning.plan_handover import END_PLANNER, STREAM, STREAM_READER, rest, stream_cause, take_plan
+from controller.planning.plan_handover import STREAM, STREAM_READER, rest, stream_cause, take_plan
 from controller.planning.points import load_points
 from controller.planning.segments import evaluate_reference
 from controller.safety.causes import Cause
 from controller.workspace import Demands, margins
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
+from hil.runs.channel_process import open_channel
 from hil.runs.operated_platform import DEADMAN_S, OperatedPlatform, Workplace
 from hil.runs.operator import Operator, RequestRefusedError
-from hil.runs.operator_channel import open_channel, serve_operator
+from hil.runs.operator_channel import serve_channel
 from hil.runs.operator_messages import VERSION, ChannelError, channel_address, decode, encode, load_token
 from plant.errors import InputError
-from plant.pose import rotation_from_vector
+from plant.mechanism import load_in_space
+from plant.pose import rotation_from_vector, vector_from_rotation
 
 FORK = multiprocessing.get_context("fork")
 PERIOD = 1e-3
@@ -78,8 +80,8 @@ class Run:
         self.listener = open_channel("127.0.0.1", 0)
         self.address = f"127.0.0.1:{self.listener.getsockname()[1]}"
         lengths = leg_lengths(mechanism, home.position, home.rotation)
-        what = self.stream, self.listener, token, self.workplace, PERIOD, self.records, self.link
-        self.channel = FORK.Process(target=serve_operator, args=what)
+        what = self.listener, token, self.workplace, "operator", PERIOD, self.records, self.link, self.stream
+        self.channel = FORK.Process(target=serve_channel, args=what)
         self.loop = FORK.Process(target=looped, args=(self.stream, lengths, self.kept, self.shared))
         for process in (self.channel, self.loop):
             process.start()
@@ -103,12 +105,12 @@ class Run:
         assert np.abs(references[:, :, 2]).max() <= limits.acceleration * (1.0 + 1e-9)
         assert np.abs(np.diff(references[:, :, 2], axis=0)).max() <= limits.jerk * PERIOD * (1.0 + 1e-6)
         assert np.abs(np.diff(references[:, :, 0], axis=0)).max() <= limits.velocity * PERIOD * (1.0 + 1e-6)
-        positions, rotations = poses_from_lengths(self.mechanism, references[:, :, 0], self.mechanism.home)
+        positions, rotations = poses_from_lengths(self.mechanism, references[:, : self.mechanism.legs, 0], self.mechanism.home)
         assert margins(self.mechanism, positions, rotations).values.min() >= -1e-6
         return positions, rotations
 
     def end(self):
-        self.stream["shared"][END_PLANNER] = 1
+        self.link[Link.DONE] = 1
         self.shared["end"] = 1
         for process in (self.channel, self.loop):
             process.join(5.0)
@@ -275,6 +277,136 @@ def test_an_operator_who_goes_away_while_jogging_is_a_controlled_stop(hexapod, h
         # The run is over for the next one, too.
         with run.operator() as operator, pytest.raises(RequestRefusedError, match="the run stops: the operator has gone"):
             operator.move("home")
+
+
+def test_a_planar_mechanism_moves_in_its_plane_alone():
+    planar = load_in_space("planar-3rpr")
+    home, home_turn = planar.home.position, vector_from_rotation(planar.home.rotation)
+    with running(planar) as run, run.operator() as operator:
+        begun(operator)
+        assert operator.run["machine"]["planar"]
+        there = operator.step((0.01, -0.005, 0.0), (0.0, 0.0, 0.05), speed=0.1, turn_speed=1.0)["commanded"]
+        np.testing.assert_allclose(there["position"], home + [0.01, -0.005, 0.0], atol=1e-9)
+        np.testing.assert_allclose(there["rotation"], home_turn + [0.0, 0.0, 0.05], atol=1e-9)
+        for _ in operator.jog((0.0, 0.02, 0.0), seconds=0.3):
+            pass
+        y = operator.wait(0.0)["commanded"]["position"][1]
+        assert 0.001 < y - home[1] + 0.005 < 0.012
+        in_plane = "planar-3rpr moves in its plane alone, along x and y and about z"
+        for bad in (
+            lambda: operator.step((0.0, 0.0, 0.005)),
+            lambda: operator.step(rotation=(0.1, 0.0, 0.0)),
+            lambda: operator.move({"position": [0.0, 0.0, 0.01]}),
+            lambda: operator.follow({"position": [0.0, 0.0, 0.01]}),
+            lambda: next(operator.jog(turn_velocity=(0.0, 0.1, 0.0))),
+        ):
+            with pytest.raises(RequestRefusedError, match=in_plane):
+                bad()
+        with pytest.raises(RequestRefusedError, match=r"stroke of leg \d would be .* the nearest pose within") as refused:
+            operator.move({"position": [0.0, 1.0, 0.0]})
+        assert refused.value.nearest["position"][2] == 0.0
+        operator.move("home", speed=0.1, turn_speed=1.0)
+        positions, _ = run.check()
+        np.testing.assert_allclose(positions[-1], home, atol=1e-7)
+        assert not run.references()[:, 3:].any() and run.cause[0] == Cause.NONE
+
+
+def test_a_goal_that_changes_is_followed_without_a_rest_and_within_all_limits(hexapod):
+    home = hexapod.home.position
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        begin = int(run.shared["cycle"][0])
+        for number in range(1, 21):
+            operator.follow({"position": [0.003 * number, -0.0015 * number, 0.0], "rotation": [0.0, 0.0, 0.004 * number]})
+            time.sleep(0.05)
+        under_way = int(run.shared["cycle"][0])
+        with pytest.raises(RequestRefusedError, match="the platform is moving: stop it first"):
+            operator.move("home")
+        with pytest.raises(RequestRefusedError, match=r"stroke of leg \d would be .* mm, with a limit of"):
+            operator.follow({"position": [0.0, 0.0, 0.3]})
+        there = operator.wait(3.0)["commanded"]
+        np.testing.assert_allclose(there["position"], home + [0.06, -0.03, 0.0], atol=1e-9)
+        np.testing.assert_allclose(there["rotation"], [0.0, 0.0, 0.08], atol=1e-9)
+        # It never rests between goals.
+        speeds = np.abs(run.kept[begin + 300 : under_way, :, 1]).max(axis=1)
+        assert speeds.min() > 1e-3
+        # Back and forth, with a stop on the way.
+        operator.follow("home")
+        time.sleep(0.1)
+        operator.follow({"position": [0.02, 0.0, 0.0], "rotation": [0.1, 0.0, 0.0]})
+        time.sleep(0.2)
+        operator.stop()
+        operator.wait(0.0)
+        operator.follow({"position": [0.0, 0.01, 0.0], "rotation": [0.0, 0.0, 0.0]})
+        time.sleep(0.1)
+        operator.pause()
+        assert operator.wait(0.0)["paused"]
+        there = operator.resume()["commanded"]
+        np.testing.assert_allclose(there["position"], home + [0.0, 0.01, 0.0], atol=1e-9)
+        positions, _ = run.check()
+        np.testing.assert_allclose(positions[-1], there["position"], atol=1e-7)
+        assert run.cause[0] == Cause.NONE
+
+
+@pytest.mark.slow
+def test_a_way_that_is_followed_keeps_to_the_limits_between_two_poses_that_can_be_reached(hexapod):
+    first, last = (0.109, -0.028, -0.01, 0.027, 0.122, 0.036), (-0.01, 0.118, -0.018, 0.283, 0.015, -0.01)
+    middle = 0.5 * np.add(first, last)
+    position, rotation = hexapod.home.position + middle[:3], rotation_from_vector(middle[3:])
+    assert margins(hexapod, position[None], rotation[None]).of("stroke").min() < -5e-3
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        operator.move({"position": first[:3], "rotation": first[3:]}, speed=0.3, turn_speed=2.0)
+        with pytest.raises(RequestRefusedError, match="on the straight way there, stroke of leg"):
+            operator.move({"position": last[:3], "rotation": last[3:]})
+        operator.follow({"position": last[:3], "rotation": last[3:]})
+        there = operator.wait(10.0)["commanded"]
+        positions, _ = run.check()
+        np.testing.assert_allclose(positions[-1], there["position"], atol=1e-6)
+        assert run.cause[0] == Cause.NONE
+
+
+def test_a_move_that_is_paused_goes_on_to_its_end_and_a_jog_stops(hexapod):
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        with pytest.raises(RequestRefusedError, match="no move has been paused"):
+            operator.resume()
+        goal = {"position": [0.02, 0.0, 0.005], "rotation": [0.0, 0.0, 0.03]}
+        operator.move(goal, speed=0.03, wait=False)
+        time.sleep(0.3)
+        operator.pause()
+        there = operator.wait(0.0)
+        assert there["paused"] and 0.001 < there["commanded"]["position"][0] < 0.019
+        operator.move({"position": [0.0, 0.0, 0.0], "relative": True})
+        assert operator.ask("state")["telemetry"]["paused"]
+        there = operator.resume()
+        np.testing.assert_allclose(there["commanded"]["position"], hexapod.home.position + goal["position"], atol=1e-9)
+        np.testing.assert_allclose(there["commanded"]["rotation"], goal["rotation"], atol=1e-9)
+        assert not there["paused"]
+        # The whole way is that of one move.
+        positions, _ = run.check()
+        along = np.array(goal["position"]) / np.linalg.norm(goal["position"])
+        off = (positions - hexapod.home.position) - ((positions - hexapod.home.position) @ along)[:, None] * along
+        assert np.linalg.norm(off, axis=1).max() < 1.5e-4
+        # Another move takes the place of what was paused, and so does who comes next.
+        operator.move("home", speed=0.03, wait=False)
+        operator.pause()
+        operator.wait(0.0)
+        operator.step((0.001, 0.0, 0.0))
+        with pytest.raises(RequestRefusedError, match="no move has been paused"):
+            operator.resume()
+        operator.ask("jog", velocity=[-0.01, 0.0, 0.0])
+        operator.pause()
+        assert not operator.wait(0.0)["paused"]
+        operator.move("home", speed=0.03, wait=False)
+        operator.pause()
+        operator.close()
+        time.sleep(0.2)
+        with run.operator() as another:
+            another.wait(0.0)
+            with pytest.raises(RequestRefusedError, match="no move has been paused"):
+                another.resume()
+        assert run.cause[0] == Cause.NONE
 
 
 def test_a_client_that_leaves_a_move_does_not_stop_it(hexapod):

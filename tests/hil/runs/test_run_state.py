@@ -5,9 +5,10 @@ import pytest
 
 from hil.loop.records import LINK_SIZE, RECORD, Link
 from hil.runs.run_state import RunState
+from plant.pose import quaternion_from_rotation, rotation_from_vector
 
 CYCLES = 60
-DISTANCE_M, TRACKING_M = 3e-3, 2e-3
+DISTANCE_M, TRACKING_M, ANGLE_RAD = 3e-3, 2e-3, 0.02
 
 
 @pytest.mark.parametrize("legs", [6, 3])
@@ -23,6 +24,11 @@ def test_the_figures_are_those_of_the_cycles_and_legs_that_there_are(legs, porti
     away = random.normal(size=(CYCLES, 3))
     records["truth"][:, :3] = random.normal(size=(CYCLES, 3))
     records["position"] = records["truth"][:, :3] + DISTANCE_M * away / np.linalg.norm(away, axis=1, keepdims=True)
+    true = [rotation_from_vector(vector) for vector in random.normal(size=(CYCLES, 3))]
+    records["truth"][:, 3:7] = quaternion_from_rotation(np.array(true))
+    records["rotation"] = [
+        rotation_from_vector(ANGLE_RAD * axis / np.linalg.norm(axis)) @ each for axis, each in zip(away, true, strict=True)
+    ]
     # A cycle without a pose has nothing to compare, one without a truth only its reference.
     records["status"][4], records["position"][4], records["lengths"][4] = 17, 5.0, 5.0
     records["truth"][10:15] = np.nan
@@ -36,6 +42,7 @@ def test_the_figures_are_those_of_the_cycles_and_legs_that_there_are(legs, porti
     found = state.errors()
     assert found["tracking"] == pytest.approx(TRACKING_M, rel=1e-9)
     assert found["estimation"] == pytest.approx(DISTANCE_M, rel=1e-9)
+    assert state.rotation_errors()["estimation"] == pytest.approx(ANGLE_RAD, rel=1e-9)
     assert found["known"] == CYCLES - 6
     assert (state.missed, state.late, state.refused_packets, state.latest["cycle"]) == (5, 3, 2, CYCLES - 1)
     figures = state.timing.figures()

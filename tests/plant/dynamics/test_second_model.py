@@ -51,7 +51,7 @@ def leaning(name: str) -> Values:
     return p | {key: np.asarray(value) for key, value in changes.items()}
 
 
-@pytest.mark.parametrize("mode", [OPEN, VELOCITY])
+@pytest.mark.parametrize("mode", [OPEN, pytest.param(VELOCITY, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "name", ["hexapod", pytest.param("6-3-I", marks=pytest.mark.slow), pytest.param("6-4-II", marks=pytest.mark.slow)]
 )

@@ -295,3 +295,26 @@ def test_what_is_hardly_meant_is_refused(tmp_path: Path, text: str, message: str
 )
 def test_what_is_unusual_and_right_is_taken(tmp_path: Path, text: str) -> None:
     load_in_space(write(tmp_path, text))
+
+
+def test_entries_may_be_changed_as_it_is_loaded(hexapod: Mechanism) -> None:
+    changes = {
+        "control.proportional": 30.0,
+        "plant.payload.mass": 12.0,
+        "geometry.base_joints.0.2": 0.01,
+        "joints.base_swing": 0.6,
+    }
+    changed = load_mechanism("hexapod", changes)
+    assert isinstance(changed, Mechanism) and changed.settings["control"]["proportional"] == 30.0
+    assert changed.plant["payload.mass"] == 12.0 and changed.base_joints[0, 2] == 0.01 and changed.joints is not None
+    # What is not named stays.
+    np.testing.assert_array_equal(changed.base_joints[1:], hexapod.base_joints[1:])
+    assert set(hexapod.settings["control"].items()) <= {
+        *changed.settings["control"].items(),
+        *hexapod.settings["control"].items(),
+    }
+    assert load_mechanism("hexapod").settings == hexapod.settings
+    with pytest.raises(UnknownNameError, match=r"hexapod: the mechanism has no entry geometry.base_joints.9.0"):
+        load_mechanism("hexapod", {"geometry.base_joints.9.0": 0.0})
+    with pytest.raises(InputError, match=r"unknown entry 'contrl'.*control"):
+        load_mechanism("hexapod", {"contrl.proportional": 30.0})
