@@ -15,7 +15,7 @@ DOCS = Path(__file__).parent
 sys.path[:0] = [str(DOCS.parent), str(DOCS / "_ext")]
 
 from hil import reference  # noqa: E402
-from hil.reference.fields import declared  # noqa: E402
+from hil.reference.fields import attributes, declared  # noqa: E402
 
 project = "gough"
 author = "the authors of gough"
@@ -38,6 +38,7 @@ html_theme = "furo"
 html_title = "gough"
 html_math_renderer = "mathml"
 html_copy_source = False
+html_show_copyright = False
 
 linkcheck_timeout = 20
 linkcheck_retries = 3
@@ -69,15 +70,25 @@ def read_docstring(_app: Sphinx, what: str, _name: str, of: Any, _options: Any, 
         if line.startswith("    ") and found and not found[-1].strip() and before[:1] not in ("", " "):
             found += ["::", ""]
         found.append(line)
-    if what == "class" and is_dataclass(of) and "Attributes:" not in found:
-        texts = declared(of)[1]
-        described = [f"    {each.name}: {texts[each.name]}" for each in fields(of) if each.name in texts]
-        found += ["Attributes:", *described, ""] if described else []
+    if what == "class" and is_dataclass(of):
+        texts, told = declared(of)[1], attributes("\n".join(found))
+        described = [f"    {each.name}: {texts[each.name]}" for each in fields(of) if each.name in texts.keys() - told.keys()]
+        if described and "Attributes:" not in found:
+            found += ["Attributes:", ""]
+        if described:
+            place = found.index("Attributes:") + 1
+            found[place:place] = described
     lines[:] = found
+
+
+def shorten_defaults(_app: Sphinx, _what: str, _name: str, _of: Any, _options: Any, call: str | None, gives: str) -> Any:
+    """Defaults such as `<factory>` are no Python, so that Sphinx could not read the types beside them."""
+    return call and (re.sub(r"<(?:[^<>]|<[^<>]*>)+>", "...", call), gives)
 
 
 def setup(app: Sphinx) -> None:
     """Connect the functions above; docstrings are read before napoleon reads their sections."""
     app.connect("source-read", put_in_tables)
     app.connect("missing-reference", link_by_last_name)
+    app.connect("autodoc-process-signature", shorten_defaults)
     app.connect("autodoc-process-docstring", read_docstring, priority=400)

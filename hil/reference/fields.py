@@ -1,6 +1,7 @@
 """Fields of a table of a TOML file: name, type, unit, default, limit and meaning, as the code states them.
 
-A dataclass says what a field means in the comment behind it, such as `# of the platform [m/s]`, or under `Attributes:`.
+A dataclass says what a field means in the comment behind it, such as `# of the platform [m/s]`, under `Attributes:`, or in the
+field's own metadata.
 """
 
 import ast
@@ -101,7 +102,7 @@ def declared(kind: type) -> tuple[dict[str, str], dict[str, str]]:
     types: dict[str, str] = {}
     texts: dict[str, str] = {}
     for each in reversed(kind.__mro__[:-1]):
-        texts |= _attributes(each.__dict__.get("__doc__") or "")
+        texts |= attributes(each.__dict__.get("__doc__") or "")
         source = dedent(inspect.getsource(each))
         (body,) = ast.parse(source).body
         assert isinstance(body, ast.ClassDef)
@@ -113,10 +114,15 @@ def declared(kind: type) -> tuple[dict[str, str], dict[str, str]]:
                 types[node.target.id] = _TYPES.get(name, name)
                 if node.end_lineno in behind:
                     texts[node.target.id] = behind[node.end_lineno]
+    for field in fields(kind):
+        if option := field.metadata.get("option"):
+            texts[field.name] = option.text + (f" [{option.unit}]" if option.unit else "")
+        elif "text" in field.metadata:
+            texts[field.name] = field.metadata["text"]
     return types, texts
 
 
-def _attributes(doc: str) -> dict[str, str]:
+def attributes(doc: str) -> dict[str, str]:
     """What a docstring says under `Attributes:`."""
     _, _, section = inspect.cleandoc(doc).partition("Attributes:\n")
     section, _, _ = section.partition("\n\n")

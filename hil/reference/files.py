@@ -439,13 +439,11 @@ def design() -> dict[str, list[Entry]]:
 
 def canopen() -> dict[str, list[Entry]]:
     """The tables of a CANopen rig's file; the defaults are those of the emulated bus, and a file gives all of them."""
-    return {f"[{name}]": _of_bus(name, kind) for name, kind in CANOPEN_TABLES.items()}
+    return {f"[{name}]": _of_bus(kind) for name, kind in CANOPEN_TABLES.items()}
 
 
-def _of_bus(name: str, kind: Any) -> list[Entry]:
-    declared = {each.name: each for each in fields(kind)}
-    texts = {name: each.metadata["text"] for name, each in declared.items()}
-    return entries_of(kind, {name: _allowed(each.metadata["check"]) for name, each in declared.items()}, **texts)
+def _of_bus(kind: Any) -> list[Entry]:
+    return entries_of(kind, {each.name: _allowed(each.metadata["check"]) for each in fields(kind)})
 
 
 def _allowed(check: Check) -> str:
