@@ -18,7 +18,6 @@ from typing import Any
 
 import viser
 
-from controller.frames import BASE, PLATFORM
 from hil.panel.margins import MARGINS_S, MarginTable
 from hil.panel.readings import Readings, event_list, set_text, set_theme
 from hil.panel.scene import Machine, Scene
@@ -129,7 +128,7 @@ class LivePanel:
     def _build_jog(self) -> None:
         gui = self._server.gui
         axis = gui.add_dropdown("Axis", tuple(_AXES[number] for number in self._free))
-        frame = gui.add_dropdown("Along", ("work frame", BASE, PLATFORM, *self._run["frames"]["names"]))
+        frame = gui.add_dropdown("Along", ("work frame", *self._run["frames"]["names"]))
         step = gui.add_number("Step [mm, deg]", 1.0, min=0.001, max=100.0, step=0.001)
         speed = gui.add_number("Speed, held [mm/s, deg/s]", 5.0, min=0.01, max=100.0, step=0.01)
 

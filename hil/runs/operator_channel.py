@@ -166,6 +166,8 @@ class _Channel:
             while line := await reader.readline():
                 writer.write(encode(self._answer(client, line)))
                 await writer.drain()
+                # Between two requests the platform goes on, however many wait.
+                await asyncio.sleep(0)
         except (OSError, ValueError):
             # It has gone, or its line has no end.
             pass

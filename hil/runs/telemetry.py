@@ -63,7 +63,7 @@ def state_message(record: Record, frames: ActiveFrames) -> dict[str, Any]:
 
 
 def frames_message(frames: ActiveFrames) -> dict[str, Any]:
-    """The enabled pair of frames, the names of all others, and the TOML text that defines them."""
+    """The enabled pair of frames, the names of all, and the TOML text that defines them."""
     return {**frames.described(), "names": list(frames.frames), "definitions": frames.frames.text()}
 
 

@@ -16,7 +16,7 @@ from hil.recording.mcap import read
 from hil.recording.replay import replay
 from hil.runs.operator import Operator
 from hil.runs.operator_messages import ChannelError
-from plant.mechanism import load_mechanism
+from plant.mechanism import load_in_space, load_mechanism
 from tests.hil.ports import free_port
 from tests.hil.runs.test_hardware_in_the_loop import PATIENT, emulated
 
@@ -96,6 +96,26 @@ def test_commands_move_the_plant_and_the_recording_replays(tmp_path):
     true = records["truth"][:, :3] - home
     assert np.linalg.norm(true - [0.0, 0.0, -0.02], axis=1).min() < 5e-4 and np.linalg.norm(true[-1]) < 5e-4
     assert json.loads((tmp_path / "run.json").read_text())["cause"] == "asked for"
+    assert replay([tmp_path / "run.mcap"]).same
+
+
+def test_three_legs_are_moved_in_their_plane_and_the_recording_replays(tmp_path):
+    home = load_in_space("planar-3rpr").home.position
+    with operated(tmp_path, "--mechanism", "planar-3rpr") as (run, address):
+        assert told("jog", "+x", "5mm", "-y", "3mm", "+rz", "2deg", "--at", address)[0] == 0
+        with Operator(address, role="observer") as observer:
+            truth = observer.ask("state")["telemetry"]["truth"]["position"]
+        np.testing.assert_allclose(truth, home + [0.005, -0.003, 0.0], atol=5e-4)
+        status, _, error = told("jog", "+z", "1mm", "--at", address)
+        assert status == 2 and "planar-3rpr moves in its plane alone, along x and y and about z" in error
+        assert told("jog", "+y", "10mm/s", "--hold", "--for", "0.5", "--at", address)[0] == 0
+        status, out, _ = told("move", "home", "--at", address)
+        assert status == 0 and "(0.00, 0.00, 0.00) mm, (0.00, 0.00, 0.00) deg from home" in out
+        with Operator(address) as operator:
+            operator.end()
+        assert run.wait(60.0) == 0, run.communicate()
+    records = poses(tmp_path)
+    assert np.linalg.norm(records["truth"][-1, :3] - home) < 5e-4 and not records["reference"][:, 3:].any()
     assert replay([tmp_path / "run.mcap"]).same
 
 

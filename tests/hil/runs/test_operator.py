@@ -348,6 +348,27 @@ def test_a_goal_that_changes_is_followed_without_a_rest_and_within_all_limits(he
         assert run.cause[0] == Cause.NONE
 
 
+def test_a_flood_of_requests_does_not_hold_up_the_platform(hexapod):
+    """Thousands of orders at once, of which each takes a while."""
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        operator.follow({"position": [0.02, 0.0, 0.0]})
+        flood = b"".join(
+            encode({"id": number, "do": "follow", "to": {"position": [0.02 + 1e-6 * number, 0.0, 0.0]}})
+            for number in range(2000)
+        )
+        with run.operator(role="observer") as observer:
+            operator._socket.sendall(flood)
+            longest = 0.0
+            for _ in range(20):
+                asked = time.monotonic()
+                observer.ask("state")
+                longest = max(longest, time.monotonic() - asked)
+            assert longest < 0.25
+        assert run.cause[0] == Cause.NONE
+        run.check()
+
+
 @pytest.mark.slow
 def test_a_way_that_is_followed_keeps_to_the_limits_between_two_poses_that_can_be_reached(hexapod):
     first, last = (0.109, -0.028, -0.01, 0.027, 0.122, 0.036), (-0.01, 0.118, -0.018, 0.283, 0.015, -0.01)
