@@ -54,6 +54,7 @@ def test_the_example_reads_its_table_and_goes_on(folder: Path, capsys: pytest.Ca
     assert row["peak"].tolist() == [float(point["peak"])]
 
 
+@pytest.mark.slow
 def test_the_columns_are_those_of_the_page(folder: Path) -> None:
     columns = pd.read_parquet(folder / "study.results" / "runs.parquet").columns
     section = PAGE[PAGE.index("| column |") : PAGE.index("In Python:")]

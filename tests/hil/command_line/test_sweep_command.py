@@ -58,7 +58,8 @@ def of_model(name: str, more: str = "") -> str:
     return f'model = "functions.py:{name}"\n[vary]\nx = [1.0, 2.0]\n{more}'
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
 def test_the_indices_of_ishigami_by_two_processes(folder: Path, seed: int) -> None:
     """First-order indices 0.314, 0.442 and 0, total ones 0.558, 0.442 and 0.244 (Ishigami and Homma 1990)."""
     ranges = "".join(f"x{number} = {RANGE}\n" for number in (1, 2, 3))

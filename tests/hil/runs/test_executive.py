@@ -309,6 +309,7 @@ def ignore_as_a_script_asks_of_its_background():
         signal.signal(number, signal.SIG_IGN)
 
 
+@pytest.mark.slow
 def test_an_emergency_stop_is_heard_by_a_run_that_was_told_to_ignore_it(tmp_path):
     path = tmp_path / "run.mcap"
     process, *others = started(path, preexec_fn=ignore_as_a_script_asks_of_its_background)

@@ -39,6 +39,7 @@ def test_platforms_are_the_folders_that_hold_binaries(tmp_path: Path) -> None:
     assert platforms_of(path) == ["linux64", "win64"]
 
 
+@pytest.mark.slow
 def test_a_trial_that_never_ends_is_ended_at_the_limit(foreign_fmu: Path, tmp_path: Path) -> None:
     path = edited(foreign_fmu, tmp_path / "hangs.fmu", ('guid="{foreign}"', 'guid="{fault 98}"'))
     checks = check_fmu(path, limit=3.0)

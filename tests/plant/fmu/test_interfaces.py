@@ -66,9 +66,8 @@ def command(t: float) -> Array:
     return command
 
 
-@pytest.mark.parametrize(
-    "model", [pytest.param(SPATIAL_MODEL, marks=pytest.mark.slow, id="spatial"), pytest.param(PLANAR_MODEL, id="planar")]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [pytest.param(SPATIAL_MODEL, id="spatial"), pytest.param(PLANAR_MODEL, id="planar")])
 def test_every_exported_fmu_is_clean_and_keeps_its_promises(model: Model) -> None:
     for path in (default_fmu(model), default_fmu(model, fmi=2)):
         assert validate_fmu(str(path)) == []
