@@ -13,9 +13,10 @@ from websockets.datastructures import Headers  # noqa: E402
 from controller.frames import ActiveFrames, Frames  # noqa: E402
 from hil.command_line import main  # noqa: E402
 from hil.loop.records import RECORD  # noqa: E402
+from hil.panel import readings  # noqa: E402
 from hil.panel.access import Gate, close_server, open_server, panel_address  # noqa: E402
-from hil.panel.readings import error_line, leg_table, pose_table, status_line  # noqa: E402
-from hil.panel.scene import Machine, leg_colors  # noqa: E402
+from hil.panel.readings import Readings, error_line, leg_table, pose_table, status_line  # noqa: E402
+from hil.panel.scene import Machine, Scene, leg_colors  # noqa: E402
 from hil.runs.telemetry import machine_message, state_message, timing_message  # noqa: E402
 from plant.errors import InputError  # noqa: E402
 
@@ -152,3 +153,16 @@ def test_a_record_becomes_a_state_and_words(hexapod, machine):
     record["position"] = np.nan
     assert "pose" not in state_message(record, frames)
     assert pose_table(state_message(record, frames), frames.described()) == "no pose"
+
+
+def test_texts_wait_for_their_turn_and_the_last_ones_do_not(machine, monkeypatch):
+    monkeypatch.setattr(readings, "_TEXT_S", 60.0)
+    server = open_server("127.0.0.1", free_port(), None)
+    try:
+        status = server.gui.add_markdown("")
+        shown = Readings(server, machine, Scene(server, machine), ActiveFrames(Frames()).described(), status)
+        for mode, at_once, said in (("running", False, "running"), ("fault", False, "running"), ("stopped", True, "stopped")):
+            shown.show({"mode": mode}, [], at_once)
+            assert status.content.startswith(f"**{said}**")
+    finally:
+        close_server(server)
