@@ -23,6 +23,7 @@ PAGES = {path.name: path.read_text() for path in (*sorted(DOCS.glob("*.md")), RO
 
 RUN_BY = {
     "README.md": "test_readme.py",
+    "compare.md": "test_compare_page.py",
     "fmu.md": "test_docs.py",
     "frames.md": "test_frames_page.py",
     "imus.md": "test_imus_page.py",
@@ -34,6 +35,9 @@ RUN_BY = {
     "workspace.md": "test_workspace_page.py",
 }
 """The tests that run the Python of a page; this one runs that of the others."""
+
+AS_A_SCRIPT = {"python.md": "test_python_page.py"}
+"""The tests that run all Python of a page as one script."""
 
 OF_A_PROCESS = ("panel", "jog", "move")
 """Commands that wait for a browser or another process; other tests run them."""
@@ -69,6 +73,9 @@ def test_the_python_of_every_page_is_run_by_a_test() -> None:
     for page in PAGES:
         if not blocks(page, "python"):
             assert page not in RUN_BY, page
+        elif page in AS_A_SCRIPT:
+            source = (ROOT / "tests" / AS_A_SCRIPT[page]).read_text()
+            assert f'"{page}"' in source and "sys.executable" in source and "SNIPPETS" in source, page
         elif page in RUN_BY:
             source = (ROOT / "tests" / RUN_BY[page]).read_text()
             assert f'"{page}"' in source and re.search(r"\b(exec|eval|runpy\.run_path)\(", source), page

@@ -44,7 +44,7 @@ def filled(dtype: np.dtype[Any], /, **values: Any) -> Record:
 
 
 PACKAGES = ("plant", "controller", "hil")
-WITHOUT_KERNELS = ("command_line", "reports", "sweep")
+WITHOUT_KERNELS = ("command_line", "panel", "reference", "reports", "sweep")
 """Rooms of `hil` on which no kernel depends; an edit there leaves all machine code as it is."""
 
 

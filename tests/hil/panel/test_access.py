@@ -13,10 +13,11 @@ from controller.frames import ActiveFrames, Frames, parse_frames  # noqa: E402
 from controller.workspace import Demands  # noqa: E402
 from hil.command_line import main  # noqa: E402
 from hil.loop.records import RECORD  # noqa: E402
+from hil.panel import readings  # noqa: E402
 from hil.panel.access import Gate, close_server, open_server, panel_address  # noqa: E402
 from hil.panel.margins import margin_table  # noqa: E402
-from hil.panel.readings import error_line, frames_to_choose, leg_table, pose_table, status_line  # noqa: E402
-from hil.panel.scene import Machine  # noqa: E402
+from hil.panel.readings import Readings, error_line, frames_to_choose, leg_table, pose_table, status_line  # noqa: E402
+from hil.panel.scene import Machine, Scene  # noqa: E402
 from hil.runs.telemetry import (  # noqa: E402
     frames_message,
     machine_message,
@@ -178,3 +179,16 @@ def test_margins_of_all_limits_come_the_closest_first(hexapod):
     assert margin_table([]) == "no pose"
     beyond = Pose(hexapod.home.position + [0.0, 0.0, 0.08], hexapod.home.rotation)
     assert "| **-" in margin_table(margins_message(hexapod, beyond, Demands()))
+
+
+def test_texts_wait_for_their_turn_and_the_last_ones_do_not(machine, monkeypatch):
+    monkeypatch.setattr(readings, "_TEXT_S", 60.0)
+    server = open_server("127.0.0.1", free_port(), None)
+    try:
+        status = server.gui.add_markdown("")
+        shown = Readings(server, machine, Scene(server, machine), frames_message(ActiveFrames(Frames())), status)
+        for mode, at_once, said in (("running", False, "running"), ("fault", False, "running"), ("stopped", True, "stopped")):
+            shown.show({"mode": mode}, [], at_once)
+            assert status.content.startswith(f"**{said}**")
+    finally:
+        close_server(server)
