@@ -5,19 +5,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from os import PathLike
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from controller.direct_kinematics import poses_from_lengths
 from controller.safety.causes import Mode
 from hil.loop.records import STAGES
-from hil.recording.mcap import events_of, read_run
+from hil.recording.mcap import events_of
+from hil.runs.recorded_run import recorded_run
 from hil.runs.simulation import SimulationResult
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
-from plant.mechanism import Mechanism, load_in_space
+from plant.mechanism import Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, pose_errors, quaternion_from_rotation, rotations_from_quaternions
 from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
 
@@ -99,8 +100,8 @@ def dataset(source: Source, mechanism: str | None = None) -> xr.Dataset:
     vector. The attributes have the configuration as JSON, the version, and the events.
 
     Args:
-        source: a simulation's result, or the recording of a run, its files in a sequence if there are several. The time of a
-            result is that of the motion, of a recording that since the first cycle [s].
+        source: a simulation's result, or the recording of a run, its files in a sequence if there are several. Time 0 is where
+            the motion begins, or the first cycle if a recording has no motion.
         mechanism: of a recording, if the file of its mechanism has moved.
 
     Raises:
@@ -108,16 +109,14 @@ def dataset(source: Source, mechanism: str | None = None) -> xr.Dataset:
     """
     if isinstance(source, SimulationResult):
         return _of_result(source)
-    files = [source] if isinstance(source, str | PathLike) else list(source)
-    recordings, records = read_run([str(each) for each in files])
-    config = recordings[0].config
-    loaded = load_in_space(mechanism or str(config["mechanism"]))
-    lengths = records["reference"][:, : loaded.legs, 0]
-    positions, rotations = poses_from_lengths(loaded, lengths, loaded.require_home(), partial=True)
-    made = _of_records(records, records["cycle"] / float(config["rate"]), loaded.legs)
+    files = [source] if isinstance(source, str | PathLike) else source
+    run = recorded_run([Path(each) for each in files], mechanism)
+    times = run.times if len(run.motion) else run.records["cycle"] * run.period
+    made = _of_records(run.records, times, run.mechanism.legs)
+    positions, rotations = run.references(np.arange(len(times)))
     made["reference_position"] = _of_axes(positions, "reference: origin of {2} in {1}")
     made["reference_quaternion"] = _of_components(rotations, "reference: maps {2} to {1}, w first")
-    return made.assign_attrs(_attributes(config, loaded, records))
+    return made.assign_attrs(_attributes(dict(run.config), run.mechanism, run.records))
 
 
 def frame(source: Source, mechanism: str | None = None) -> Any:
