@@ -59,6 +59,7 @@ _DURATIONS = {
 FIGURES = {
     **_ERRORS,
     "whole.estimation": Figure("estimate - truth with the hold, position RMS [mm]", _MM),
+    "whole.rotation": Figure("estimate - truth with the hold, rotation RMS [deg]", _DEG),
     "whole.lengths": Figure("reference - length with the hold, RMS [mm]", _MM),
     **_LEVELS,
     "target_stretch": Figure("stretch of the target's times"),
@@ -309,7 +310,7 @@ def _of_simulation(source: str, content: dict[str, Any]) -> _Loaded:
 
 def _of_run(source: str, content: dict[str, Any]) -> _Loaded:
     errors, timing, config = content["errors_m"], content["timing_us"], _config(content["config"])
-    figures = {"whole.lengths": errors["tracking"]} | ({"whole.estimation": errors["estimation"]} if errors["known"] else {})
+    figures = _with_the_hold(errors, content.get("errors_rad", {}))
     figures |= {f"protection.{name}_max": value for name, value in (content["protection"] or {}).items()}
     for group, stage in (("compute", "compute"), ("late", "wake")):
         figures |= {f"{group}.{name}": 1e-6 * timing[stage][name] for name in _TIMES}
@@ -327,12 +328,20 @@ def _of_recording(source: str, run: RecordedRun) -> _Loaded:
         raise InputError(f"{source} has no motion: the run ended before it began; leave it out")
     state = RunState()
     state.add(run.records)
-    errors = state.errors()
-    figures = {"whole.lengths": errors["tracking"]} | ({"whole.estimation": errors["estimation"]} if errors["known"] else {})
+    figures = _with_the_hold(state.errors(), state.rotation_errors())
     events = tuple(f"cycle {cycle}: {text}" for cycle, text in run.events)
     figures["events"] = len(events)
     seconds = float(times[-1]) + run.period
     return _Loaded(source, "recording", str(run.config["version"]), _config(run.config), seconds, events, figures, run)
+
+
+def _with_the_hold(errors: Mapping[str, float], rotation: Mapping[str, float]) -> dict[str, float]:
+    """The figures of the errors that a run sums up; an older version did not tell that of the rotation."""
+    figures = {"whole.lengths": errors["tracking"]}
+    if errors["known"]:
+        figures["whole.estimation"] = errors["estimation"]
+        figures |= {"whole.rotation": rotation["estimation"]} if rotation else {}
+    return figures
 
 
 def _config(values: Mapping[str, Any]) -> dict[str, Any]:

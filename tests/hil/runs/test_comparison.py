@@ -112,6 +112,7 @@ def test_what_was_written_of_a_run_is_taken_as_it_is(compared, folder):
     told, summary = (json.loads((folder / name).read_text()) for name in ("long.json", "simulated.json"))
     for made in (recorded, of_run):
         assert made.figures["whole.estimation"] == pytest.approx(told["errors_m"]["estimation"], rel=1e-9)
+        assert made.figures["whole.rotation"] == pytest.approx(told["errors_rad"]["estimation"], rel=1e-9)
         assert made.figures["whole.lengths"] == pytest.approx(told["errors_m"]["tracking"], rel=1e-9)
         assert made.figures["events"] == len(told["events"])
     assert of_run.figures["compute.p999"] == 1e-6 * told["timing_us"]["compute"]["p999"]
