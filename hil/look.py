@@ -8,7 +8,7 @@ from plant.pose import Array
 
 AXIS_NAMES = ("x", "y", "z")
 LEG_NAMES = tuple(f"leg {k}" for k in range(LEGS))
-ESTIMATE, REFERENCE, TRUTH, TARGET = "estimate", "reference", "truth", "target"
+ESTIMATE, REFERENCE, TRUTH = "estimate", "reference", "truth"
 POSITION, ROTATION, LENGTH, ROOM, SPEED = "position [mm]", "rotation [deg]", "length [mm]", "room [mm]", "speed [mm/s]"
 COLORINGS = ("stroke", "speed", "IMUs")
 """What the colours of the legs may show."""
@@ -30,6 +30,11 @@ LEG_SCALE = ((0.0, GOOD), (_WARM_AT, WARM), (1.0, BAD))
 
 BASE_COLOR, PLATFORM_COLOR, REFERENCE_COLOR, TRUTH_COLOR = "#5c6873", "#6d87a3", "#2f6fb5", "#d1495b"
 """The plates, and the ghosts of where the platform should be and of where it is."""
+
+TUBE_SHARE = 0.62
+"""The drawn length of a leg's lower part, as a share of the leg's least length."""
+VIEWED_FROM = (1.15, -1.4, 0.0)
+"""The side from which a mechanism is seen."""
 
 SERIES = ("#3b6fb6", "#e8871e", "#3a9d6e", "#c8403f", "#8a5fb0", "#3fa7b8", "#b0a03a", "#7d5a44", "#e377c2", "#7f7f7f")
 """Colours of what has no colour of its own, such as runs, in their order."""

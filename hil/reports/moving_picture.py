@@ -15,6 +15,8 @@ from hil.look import (
     PLATFORM_COLOR,
     REFERENCE,
     REFERENCE_COLOR,
+    TUBE_SHARE,
+    VIEWED_FROM,
     leg_colors,
     ring,
     stroke_shares,
@@ -33,11 +35,9 @@ _SAMPLES, _SAMPLE_RATE_HZ, _KEYFRAMES = 3000, 50.0, 300
 _CAPTIONS, _CAPTION_S = 60, 0.25
 """The most captions, and about how long each stays [s] unless there would be more."""
 _ELEVATION = np.arctan(np.sqrt(0.5))
-_TUBE = 0.62
-"""The drawn length of a leg's lower part, as a share of the leg's least length."""
 
 
-class Projection(NamedTuple):
+class _Projection(NamedTuple):
     """Parallel projection to the picture: pixels are `offset` (2,) + points [m] @ `axes` (3, 2)."""
 
     axes: Array
@@ -75,7 +75,7 @@ def picture_svg(result: SimulationResult) -> str:
     moving = result.times >= 0.0
     path = result.target_positions[moving][:: max(1, int(moving.sum()) // _SAMPLES)]
     base = mechanism.base_joints
-    project = projection(mechanism, np.concatenate([base, path, *course.joints]))
+    project = _projection(mechanism, np.concatenate([base, path, *course.joints]))
     ends = base + _tube_shares(mechanism, course)[..., None] * (course.joints - base)
     tubes = np.stack([np.broadcast_to(project(base), (*ends.shape[:2], 2)), project(ends)], axis=2)
     rods = np.stack([project(ends), project(course.joints)], axis=2)
@@ -105,13 +105,13 @@ def picture_svg(result: SimulationResult) -> str:
     return svg.document(_WIDTH, _HEIGHT, body)
 
 
-def projection(mechanism: Mechanism, points: Array) -> Projection:
+def _projection(mechanism: Mechanism, points: Array) -> _Projection:
     """The isometric view, or of a planar mechanism the view along its axis, that has all points (N, 3) [m] in the picture."""
     up = mechanism.up_in_base
     if mechanism.planar:
         across = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     else:
-        aside = np.array([1.15, -1.4, 0.0])
+        aside = np.array(VIEWED_FROM)
         aside = aside - (aside @ up) * up
         eye = np.cos(_ELEVATION) * aside / np.linalg.norm(aside) + np.sin(_ELEVATION) * up
         right = np.cross(up, eye) / np.linalg.norm(np.cross(up, eye))
@@ -123,7 +123,7 @@ def projection(mechanism: Mechanism, points: Array) -> Projection:
     room = np.array([_WIDTH, _HEIGHT - _CAPTION]) - 2.0 * _MARGIN
     scale = float((room / np.maximum(most - least, 1e-9)).min())
     middle = np.array([_WIDTH, _HEIGHT - _CAPTION]) / 2.0
-    return Projection(scale * axes, middle - scale * (least + most) / 2.0)
+    return _Projection(scale * axes, middle - scale * (least + most) / 2.0)
 
 
 def _course(result: SimulationResult) -> _Course:
@@ -165,7 +165,7 @@ def _last_known(values: Array) -> Array:
 def _tube_shares(mechanism: Mechanism, course: _Course) -> Array:
     """The drawn length of each leg's lower part over the leg's (m, n)."""
     lengths = np.linalg.norm(course.joints - mechanism.base_joints, axis=2)
-    shares: Array = _TUBE * mechanism.require_limits().stroke[:, 0] / lengths
+    shares: Array = TUBE_SHARE * mechanism.require_limits().stroke[:, 0] / lengths
     return shares
 
 

@@ -24,6 +24,7 @@ from hil.look import (
     REFERENCE_COLOR,
     TRUTH,
     TRUTH_COLOR,
+    TUBE_SHARE,
     imu_shares,
     ring,
     speed_shares,
@@ -41,8 +42,6 @@ from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS
 _QUANTITIES = (("position", "mm", 1e3), ("rotation", "deg", np.degrees(1.0)))
 _PATH_POINTS = 600
 _FRAMES, _FRAME_RATE_HZ, _SLOWEST_HZ = 150, 25.0, 15.0
-_TUBE = 0.62
-"""The drawn length of a leg's lower part, as a share of the leg's least length."""
 
 
 class _Panel(NamedTuple):
@@ -337,7 +336,7 @@ def _mechanism_view(result: SimulationResult) -> tuple[str, go.Figure]:
     rims = [joints_at(*poses)[:, platform_ring] for poses in ghosts.values()]
     shares = _leg_shares(result, shown, 1e-3 * np.linalg.norm(joints - base, axis=2))
     numbers = base + 0.12 * (base - base.mean(axis=0))
-    tube = _TUBE * 1e3 * mechanism.require_limits().stroke[:, :1]
+    tube = TUBE_SHARE * 1e3 * mechanism.require_limits().stroke[:, :1]
     triad = 0.4 * np.linalg.norm(platform, axis=1).max()
 
     def moving_parts(k: int) -> list[Any]:

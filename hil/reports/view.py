@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import plotly.graph_objects as go
 
-from hil.look import AXIS_NAMES, BASE_COLOR, COLORS, FAINT, GRID, LEG_SCALE, NEUTRAL, PLATFORM_COLOR
+from hil.look import AXIS_NAMES, BASE_COLOR, COLORS, FAINT, GRID, LEG_SCALE, NEUTRAL, PLATFORM_COLOR, VIEWED_FROM
 from plant.pose import Array
 
 VIEW = {"margin": {"l": 0, "r": 0, "t": 0, "b": 10}, "showlegend": False}
@@ -18,7 +18,7 @@ def scene(points: Array, up: Array, front: Array | None = None) -> dict[str, Any
     """Fixed axes with equal scales around `points` (N, 3), of which some may be NaN, seen from above, or along `front` (3,)."""
     margin = 0.05 * (np.nanmax(points, axis=0) - np.nanmin(points, axis=0)).max()
     ranges = np.stack([np.nanmin(points, axis=0) - margin, np.nanmax(points, axis=0) + margin], axis=1)
-    aside = np.array([1.15, -1.4, 0.0])
+    aside = np.array(VIEWED_FROM)
     eye = aside + (0.6 - aside @ up) * up
     if front is not None:
         # The camera's unit is the edge of the cube that has the volume of the scene.

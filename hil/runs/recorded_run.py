@@ -75,8 +75,8 @@ class RecordedRun:
 
     @property
     def truth_known(self) -> bool:
-        """Whether the rig gives its true pose."""
-        return bool(np.isfinite(self.records["truth"][:1, :7]).all())
+        """Whether the rig gives its true pose, if only from some cycle on."""
+        return bool(np.isfinite(self.records["truth"][:, :7]).all(axis=1).any())
 
     def estimates(self, rows: NDArray[np.intp]) -> tuple[Array, Array]:
         """The estimated positions (n, 3) [m] and rotations (n, 3, 3) of records."""
@@ -87,14 +87,17 @@ class RecordedRun:
         truth = self.records["truth"][rows]
         return truth[:, TRUTH_POSITION], rotations_from_quaternions(np.ascontiguousarray(truth[:, TRUTH_QUATERNION]))
 
-    def references(self, rows: NDArray[np.intp], near: Pose | None = None) -> tuple[Array, Array]:
-        """The poses (n, 3) [m] and (n, 3, 3) that the reference's lengths have, the first of them near a pose, else near home;
-        NaN from where on they have none.
+    def references(self, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+        """The poses (n, 3) [m] and (n, 3, 3) that the reference's lengths have, the first of them near the estimate, else
+        near home; NaN from where on they have none.
         """
         lengths = self.records["reference"][rows, : self.mechanism.legs, 0]
         if not np.isfinite(lengths).all():
             return np.full((len(rows), 3), np.nan), np.full((len(rows), 3, 3), np.nan)
-        return poses_from_lengths(self.mechanism, lengths, near or self.mechanism.require_home(), partial=True)
+        near = Pose(*(values[0] for values in self.estimates(rows[:1])))
+        if not (np.isfinite(near.position).all() and np.isfinite(near.rotation).all()):
+            near = self.mechanism.require_home()
+        return poses_from_lengths(self.mechanism, lengths, near, partial=True)
 
     def at(self, seconds: float) -> int:
         """The record at a time since the first cycle [s]."""

@@ -20,7 +20,7 @@ from plant.mechanism.joint_circles import reshaped_entries
 GEOMETRY_FIGURE = "geometry."
 """How the names of figures begin that need no run."""
 Result = TypeVar("Result")
-_OF_THIS_RUN = ("config", "version", "real_time_factor", "cycle_us")
+_OF_THIS_RUN = ("config", "version", "motion_s", "real_time_factor", "cycle_us")
 """Parts of a summary that are no figures, or not the same each time."""
 _OF_SUMMARY = (
     "truth_known",
