@@ -23,12 +23,14 @@ PAGES = {path.name: path.read_text() for path in (*sorted(DOCS.glob("*.md")), RO
 
 RUN_BY = {
     "README.md": "test_readme.py",
+    "compare.md": "test_compare_page.py",
     "fmu.md": "test_docs.py",
     "frames.md": "test_frames_page.py",
     "imus.md": "test_imus_page.py",
     "motions.md": "test_motions_page.py",
     "operating.md": "test_operating_page.py",
     "optimisation.md": "test_optimisation_page.py",
+    "python.md": "test_python_page.py",
     "sweeps.md": "test_sweeps_page.py",
     "tuning.md": "test_tuning_page.py",
     "workspace.md": "test_workspace_page.py",
@@ -71,7 +73,7 @@ def test_the_python_of_every_page_is_run_by_a_test() -> None:
             assert page not in RUN_BY, page
         elif page in RUN_BY:
             source = (ROOT / "tests" / RUN_BY[page]).read_text()
-            assert f'"{page}"' in source and re.search(r"\b(exec|eval|runpy\.run_path)\(", source), page
+            assert f'"{page}"' in source and re.search(r"\b(exec|eval|runpy\.run_path)\(|\bsys\.executable\b", source), page
         else:
             assert re.search(rf'run_python\(\s*"{page}"', here), page
 
