@@ -31,8 +31,6 @@ autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 napoleon_use_ivar = True
 python_use_unqualified_type_names = True
-# What only gough's own code makes.
-nitpick_ignore_regex = [("py:class", r"hil\.(option\.Named\w*|runs\.prepare\.PreparedLoop|loop\.own_stages\.Replacement)")]
 
 html_theme = "furo"
 html_title = "gough"

@@ -30,6 +30,7 @@ RUN_BY = {
     "motions.md": "test_motions_page.py",
     "operating.md": "test_operating_page.py",
     "optimisation.md": "test_optimisation_page.py",
+    "python.md": "test_python_page.py",
     "sweeps.md": "test_sweeps_page.py",
     "tuning.md": "test_tuning_page.py",
     "workspace.md": "test_workspace_page.py",
@@ -78,7 +79,7 @@ def test_the_python_of_every_page_is_run_by_a_test() -> None:
             assert f'"{page}"' in source and "sys.executable" in source and "SNIPPETS" in source, page
         elif page in RUN_BY:
             source = (ROOT / "tests" / RUN_BY[page]).read_text()
-            assert f'"{page}"' in source and re.search(r"\b(exec|eval|runpy\.run_path)\(", source), page
+            assert f'"{page}"' in source and re.search(r"\b(exec|eval|runpy\.run_path)\(|\bsys\.executable\b", source), page
         else:
             assert re.search(rf'run_python\(\s*"{page}"', here), page
 
