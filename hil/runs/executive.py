@@ -2,8 +2,9 @@
 
     supervisor --fork--> loop       plant or rig, compiled cycle, SCHED_FIFO; writes into shared memory and never waits
                --fork--> recorder   takes the records to an MCAP file
+               --fork--> channel    tells clients what the records say (`hil.runs.channel_process`)
 
-The three share two arrays, `records` and `link`. Whichever other process dies, the recorder completes its file. If it dies
+They share two arrays, `records` and `link`. Whichever other process dies, the recorder completes its file. If it dies
 itself, another takes over with a file of its own. If the supervisor dies, the loop comes to a controlled stop.
 """
 
