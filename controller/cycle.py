@@ -326,6 +326,9 @@ def run_stages(
         return Cause.NONE.value
     t = now(m.timespec)
     if first <= CycleStage.SCREENING < last:
+        if time.missed > 0 and s.safety.stop.cause == Cause.NONE and s.reference.due_cycle != time.cycle + 1:
+            # The stages before the control read the reference, too.
+            _update_reference(parameters, state, segments)
         imu_health.screen_imus(
             p.imus, s.imus, rig, time, s.safety.watch.silent, measurement, s.reference.motion, s.safety.events
         )  # fmt: skip

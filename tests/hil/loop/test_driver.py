@@ -1,16 +1,21 @@
 """The loop around the cycle on a scripted clock: its records, late wake-ups, long work, missed periods and stops."""
 
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
 import pytest
 
-from controller.cycle import STATE, prepare_next, skip_periods
+from controller.cycle import MARKS, STATE, prepare_next, skip_periods
+from controller.inverse_kinematics import leg_lengths
+from controller.planning.plan_handover import STREAM, TAKEN, publish_plan
+from controller.planning.stream_planner import StreamPlanner
 from controller.safety.causes import Cause
 from hil.loop.compiled_loop import run_loop
 from hil.loop.driver import FmuRig, Loop
 from hil.loop.records import RECORD, STAGES, Link
 from hil.realtime.clock import REAL, SCRIPTED, new_clock
+from hil.recording.replay import COMPARED, _replay
 from hil.runs.config import SimulationConfig
 from hil.runs.prepare import prepared_loop
 from plant.compiled.linking import flat_linking
@@ -112,6 +117,31 @@ def test_a_late_wake_up_skips_whole_periods_and_keeps_the_phase(periods):
         assert errors[401:].max() < 2e-3
         found = replayed(loop, records)
         np.testing.assert_array_equal(found["command"], records["command"])
+
+
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+def test_a_stream_that_is_followed_over_missed_periods_replays_bit_for_bit(fusion):
+    """The plans are not recorded: the recorded references must be all that the cycle has taken from them."""
+    with prepared_loop(replace(CONFIG, target="stream", fusion=fusion)) as loop:
+        home, began = loop.segments.copy(), 0.3
+        scripted(loop, late={100: 2 * MS + 5, 480: 3 * MS + 9, 620: MS + 1, 900: 8 * MS + 3})
+        loop.stream = np.zeros((), STREAM)
+        planner = StreamPlanner(loop.mechanism, leg_lengths(loop.mechanism, loop.target.start.position, np.eye(3)))
+        for k in range(60):
+            planner.add(0.01 * k, [0.004 * np.sin(0.1 * k), 0.0, 0.003 * (1.0 - np.cos(0.1 * k))], [1.0, 0.0, 0.0, 0.0])
+            at = began + 0.01 * k
+            loop.run(loop.cycle_at(at))
+            if (plan := planner.plan(at + 0.02, 0.01 * k)) is not None:
+                publish_plan(loop.stream, plan.segments, plan.begin, int(loop.stream["shared"][TAKEN]))
+                loop.run(loop.cycle_at(at) + 3)
+                planner.follow(plan)
+        records = written(loop)
+        moved = np.ptp(records["reference"][:, :6, 0], axis=0).max()
+        assert moved > 2e-3 and records["missed"].sum() == 14 and loop.stream["shared"][TAKEN] > 10
+        again, marks = np.zeros_like(records), np.zeros((), MARKS)[()]
+        assert _replay(loop.parameters, np.zeros((), STATE), home, records, again, marks, True) == len(records)
+        for name in COMPARED:
+            np.testing.assert_array_equal(again[name], records[name], err_msg=name)
 
 
 def test_long_work_of_our_own_is_told_from_work_that_the_host_held_up():

@@ -99,7 +99,7 @@ def test_commands_move_the_plant_and_the_recording_replays(tmp_path):
     assert replay([tmp_path / "run.mcap"]).same
 
 
-def test_three_legs_are_moved_in_their_plane(tmp_path):
+def test_three_legs_are_moved_in_their_plane_and_the_recording_replays(tmp_path):
     home = load_in_space("planar-3rpr").home.position
     with operated(tmp_path, "--mechanism", "planar-3rpr") as (run, address):
         assert told("jog", "+x", "5mm", "-y", "3mm", "+rz", "2deg", "--at", address)[0] == 0
@@ -116,6 +116,7 @@ def test_three_legs_are_moved_in_their_plane(tmp_path):
         assert run.wait(60.0) == 0, run.communicate()
     records = poses(tmp_path)
     assert np.linalg.norm(records["truth"][-1, :3] - home) < 5e-4 and not records["reference"][:, 3:].any()
+    assert replay([tmp_path / "run.mcap"]).same
 
 
 @pytest.mark.parametrize("rig", ["fmu", "udp"])
