@@ -81,8 +81,8 @@ def handle_cause(
 def _begin_stop(p: Record, s: Record, rig: Record, time: Record, reference: Record, pid: Record, cause: int) -> None:
     """Leave the motion for the fastest stop within the limits, leg by leg.
 
-    Before the motion there is nothing to stop. In missed periods the drives followed the last command, so a stop that is asked for
-    before the cycle begins where that has led; within the cycle, the reference is that of the present.
+    Before the motion there is nothing to stop. In missed periods the drives followed the last command, so a stop that is asked
+    for before the cycle begins where that has led; within the cycle, the reference is that of the present.
     """
     s.stop.cause = cause
     s.stop.cycle = s.stop.end_cycle = time.cycle
