@@ -326,7 +326,7 @@ def run_stages(
         return Cause.NONE.value
     t = now(m.timespec)
     if first <= CycleStage.SCREENING < last:
-        if time.missed > 0 and s.safety.stop.cause == Cause.NONE and s.reference.due_cycle != time.cycle + 1:
+        if time.behind > 0 and s.safety.stop.cause == Cause.NONE:
             # The stages before the control read the reference, too.
             _update_reference(parameters, state, segments)
         imu_health.screen_imus(
@@ -502,6 +502,7 @@ def skip_periods(state: Record, missed: int) -> None:
     """Before a cycle: say how many periods were missed since the last one."""
     time = state[()].time
     time.missed = missed
+    time.behind = missed
     time.cycle += missed
 
 
@@ -552,5 +553,6 @@ def _update_reference(parameters: Record, state: Record, segments: Array) -> Non
     """The reference of this cycle, in {1}."""
     p, s = parameters[()], state[()]
     reference.update_reference(s.reference, p.rig, s.time, s.safety, segments)
+    s.time.behind = 0
     if p.level.active != 0:
         level_frame.follow_level_target(p.level, s.level, p.rig, s.safety, s.base, s.reference)

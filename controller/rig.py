@@ -39,6 +39,7 @@ RIG = record_dtype(
 TIME = record_dtype(
     cycle=np.int64,  # number of the present cycle, in periods
     missed=np.int64,  # periods that were missed since the last cycle
+    behind=np.int64,  # by how many of them the reference is behind
 )
 """The time, in periods."""
 

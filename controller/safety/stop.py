@@ -81,16 +81,16 @@ def handle_cause(
 def _begin_stop(p: Record, s: Record, rig: Record, time: Record, reference: Record, pid: Record, cause: int) -> None:
     """Leave the motion for the fastest stop within the limits, leg by leg.
 
-    Before the motion there is nothing to stop. In missed periods the drives followed the last command, so a stop that is asked
-    for before the cycle begins where that has led; within the cycle, the reference is that of the present.
+    Before the motion there is nothing to stop. In missed periods the drives followed the last command, so a stop begins where
+    that has led, until the reference is that of the present cycle.
     """
     s.stop.cause = cause
     s.stop.cycle = s.stop.end_cycle = time.cycle
     if s.mode == Mode.RUNNING:
-        if time.missed > 0 and reference.due_cycle != time.cycle + 1:
+        if time.behind > 0:
             for k in range(rig.legs):
                 speed = min(max(pid.command[k], -p.velocity_limit), p.velocity_limit)
-                reference.motion[k, 0] += time.missed * rig.period * speed
+                reference.motion[k, 0] += time.behind * rig.period * speed
                 reference.motion[k, 1], reference.motion[k, 2] = speed, 0.0
         duration = plan_stop(reference.motion, p.acceleration_limit, p.jerk_limit, s.stop.segments)
         s.stop.end_cycle += int(np.ceil(duration / rig.period)) + p.settling_cycles

@@ -52,10 +52,10 @@ class Loop:
     emulator: UdpEmulator | None = None  # the other side of `udp`, if it is in memory
     stream: Record | None = None  # of a streamed target
     failure: str = ""  # what a rig or a stage in Python has raised, in words
-    error: Exception | None = None  # that a stage in Python has raised
+    error: BaseException | None = None  # that a stage in Python has raised
 
     def __post_init__(self) -> None:
-        self._failed, self._skips = Cause.NONE.value, False
+        self._failed, self._skips, self._broken = Cause.NONE.value, False, False
         self._stream_reader: Record = np.zeros((), STREAM_READER)
         self._work: Record = np.zeros((), WORK)
         self._work["feedback"], self._work["sequence"] = new_feedback(), -1
@@ -105,6 +105,7 @@ class Loop:
         self._failed = process_feedback(self.parameters, self.state, work, status)
         # After a fault the stages only ramp the commands down.
         self._skips = self._failed != Cause.NONE or self.state["safety"]["mode"] == Mode.FAULT
+        self._broken = False
         return cause
 
     def compute(self, first: CycleStage, last: CycleStage, replacements: Sequence[Replacement] = ()) -> None:
@@ -112,9 +113,22 @@ class Loop:
         for each in replacements:
             if first <= each.before < last and not self._skips:
                 self._run_stages(first, each.before)
-                self._replace(each)
+                self.replace(each)
                 first = each.then
         self._run_stages(first, last)
+
+    def replace(self, replacement: Replacement) -> None:
+        """Let a replacement run, unless another one has failed in this cycle; one that fails ends the run by a quick stop."""
+        if self._broken or self._skips:
+            return
+        timespec = self.clock["timespec"]
+        began = now(timespec)
+        try:
+            replacement.run()
+        except (Exception, SystemExit) as error:
+            self._broken, self.failure, self.error = True, f"{type(error).__name__}: {error}", error
+            react(self.parameters, self.state, Cause.STAGE_FAILED.value, -1, np.nan, np.nan)
+        self._work["marks"]["ns"][replacement.of] += now(timespec) - began
 
     def finish(self, first: CycleStage, replacements: Sequence[Replacement] = ()) -> None:
         """Run the stages from `first` on, and end the cycle."""
@@ -177,21 +191,11 @@ class Loop:
                 self.parameters, self.state, measurement, self.segments, marks, first.value, last.value
             )  # fmt: skip
 
-    def _replace(self, replacement: Replacement) -> None:
-        timespec = self.clock["timespec"]
-        began = now(timespec)
-        try:
-            replacement.run()
-        except Exception as error:
-            self.failure, self.error = f"{type(error).__name__}: {error}", error
-            react(self.parameters, self.state, Cause.STAGE_FAILED.value, -1, np.nan, np.nan)
-        self._work["marks"]["ns"][replacement.of] += now(timespec) - began
-
     def _exchange(self, rig: Rig, request: int, feedback: Record) -> int:
         try:
             return int(rig.exchange(self.state["pid"]["command"], request, feedback))
         except Exception as error:
-            self.failure = f"{type(error).__name__}: {error}"
+            self.failure = self.failure or f"{type(error).__name__}: {error}"
             return _RAISED
 
 
@@ -207,7 +211,8 @@ def prevent_compilation() -> Iterator[None]:
 
     class Listener(event.Listener):
         def on_start(self, event: Any) -> None:
-            raise RuntimeError(f"{event.data['dispatcher']} was to be compiled while the loop is on the clock")
+            name = event.data["dispatcher"]
+            raise RuntimeError(f"{name} was to be compiled while the loop is on the clock: call it once before the run")
 
         def on_end(self, event: Any) -> None:
             pass

@@ -31,7 +31,6 @@ class Cycle:
         period: time from one cycle to the next [s].
         angular_velocity, specific_force, magnetic_field: (7, 3) each [rad/s, m/s^2, uT], calibrated readings of the IMUs, each
             in its own axes.
-        directions: (L, 3), unit, of the legs in {1}, from base to platform joint.
         vertical: (3,), unit, seen in {2}.
         position, rotation: (3,) [m] and (3, 3), the estimated pose of {2} in {1}.
         twist: (6,), velocity and angular velocity of {2} in {1} [m/s, rad/s].
@@ -53,7 +52,7 @@ class Cycle:
         self.angular_velocity = _seen(sample[GYROSCOPE])
         self.specific_force = _seen(sample[ACCELEROMETER])
         self.magnetic_field = _seen(sample[MAGNETOMETER])
-        self.directions = _seen(s["legs"]["directions"][:legs])
+        self._directions, self._used = s["legs"]["directions"][:legs], s["legs"]["used"][:legs]
         self.vertical = _seen(s["platform"]["vertical"])
         self.position, self.rotation, self.twist = (_seen(pose[name]) for name in ("position", "rotation", "twist"))
         self.lengths = _seen(pose["lengths"][:legs])
@@ -89,8 +88,14 @@ class Cycle:
 
     @property
     def driving(self) -> bool:
-        """Whether the drives follow commands; else they are braked, or stop by themselves."""
-        return bool(self._state["safety"]["request"] == Request.ENABLED and self.mode >= Mode.RUNNING)
+        """Whether the drives follow the commands of the motion; else they are braked, or the run stops."""
+        return bool(self._state["safety"]["request"] == Request.ENABLED and self.mode == Mode.RUNNING)
+
+    @property
+    def directions(self) -> Array:
+        """(L, 3), unit, of the legs in {1}, from base to platform joint; NaN for a leg whose direction is not used."""
+        found: Array = np.where(self._used[:, None] != 0.0, self._directions, np.nan)
+        return found
 
     @property
     def imus_used(self) -> NDArray[np.bool_]:
@@ -113,9 +118,9 @@ class Stages:
         directions: the legs' directions (L, 3) in {1}, in place of the leg filters'; NaN for a leg without one. The rates stay
             those of the leg filters.
         pose: the pose of {2} in {1}, in place of direct kinematics, refinement and whole-mechanism filter; None if there is
-            none, which ends the run by a quick stop. Covariance and protection level stay those of gough's own estimate.
+            none, which ends the run by a quick stop. Twist, covariance and protection level stay those of gough's own estimate.
         command: the velocity of each drive (L,) [m/s], in place of feed-forward and PID; it is cut off at the largest command.
-            It is asked for while the drives follow commands.
+            It is asked for while the platform follows the motion. A controlled stop is gough's.
     """
 
     directions: Callable[[Cycle], ArrayLike] | None = None
@@ -151,15 +156,15 @@ class Replacement(NamedTuple):
 def replacements_of(stages: Stages, cycle: Cycle, parameters: Record, state: Record) -> list[Replacement]:
     """What a loop does for these stages."""
     p, s = parameters[()], state[()]
-    legs, made = int(p["rig"]["legs"]), []
+    legs, weight, made = int(p["rig"]["legs"]), float(p["legs"]["weight"]), []
     if (directions := stages.directions) is not None:
 
         def replace_directions() -> None:
             kept, own = s["legs"], checked_array(directions(cycle), (legs, 3), "what directions returns", allow_nan=True)
             for k, each in enumerate(own):
-                if np.isnan(each).any():
-                    kept["used"][k] = kept["weights"][k] = 0.0
-                else:
+                known = not np.isnan(each).any()
+                kept["used"][k], kept["weights"][k] = float(known), weight * known
+                if known:
                     kept["directions"][k] = checked_unit(each, 3, f"the direction of leg {k}")
 
         made.append(Replacement(CycleStage.PLATFORM, CycleStage.LEGS, replace_directions))
@@ -167,10 +172,11 @@ def replacements_of(stages: Stages, cycle: Cycle, parameters: Record, state: Rec
 
         def replace_pose() -> None:
             own, kept = pose(cycle), s["pose"]
-            kept["found"] = own is not None
             if own is not None:
-                kept["position"] = checked_array(own.position, (3,), "the position that pose returns")
-                kept["rotation"] = checked_rotation(own.rotation, "the rotation that pose returns")
+                position = checked_array(own.position, (3,), "the position that pose returns")
+                rotation = checked_rotation(own.rotation, "the rotation that pose returns")
+                kept["position"], kept["rotation"] = position, rotation
+            kept["found"] = own is not None
 
         made.append(Replacement(CycleStage.CONTROL, CycleStage.POSE, replace_pose))
     if (command := stages.command) is not None:
@@ -189,12 +195,15 @@ def ordered(replacements: Iterable[Replacement]) -> list[Replacement]:
 
 
 def replace_command(parameters: Record, state: Record, cycle: Cycle, command: ArrayLike) -> None:
-    """Put commands (L,) [m/s] in place of those of this cycle, if the drives follow commands.
+    """Put commands (L,) [m/s] in place of those of this cycle, if the platform follows the motion.
+
+    Of other commands than its own the PID integrates nothing, as a stop would begin with it.
 
     Raises:
         InputError: their number is not that of the legs, or they are not finite.
     """
     legs, limit = int(parameters["rig"]["legs"]), float(parameters["pid"]["limit"])
     own = checked_array(command, (legs,), "the command")
-    if cycle.driving:
+    if cycle.driving and not np.array_equal(own, cycle.command):
         state["pid"]["command"][:legs] = np.clip(own, -limit, limit)
+        state["pid"]["integral"] = 0.0

@@ -155,15 +155,12 @@ def _replay(
             return k
         skip_periods(state, recorded.missed)
         if streamed and s.safety.stop.cause == Cause.NONE:
-            # The recorded reference replaces the stream's plans.
+            # The recorded reference replaces the stream's plans; it contains how a stop dealt with missed periods.
             s.reference.motion[:] = recorded.reference
             s.reference.due_cycle = s.time.cycle + 1
+            s.time.behind = 0
         if recorded.asked != Cause.NONE:
-            if streamed:
-                # The recorded reference contains how the stop dealt with missed periods.
-                s.time.missed = 0
             react(parameters, state, recorded.asked, -1, np.nan, np.nan)
-            s.time.missed = recorded.missed
         measurement[0] = recorded.angular_velocity
         measurement[1] = recorded.specific_force
         measurement[2] = recorded.magnetic_field

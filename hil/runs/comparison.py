@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.safety.causes import Cause
 from hil.loop.records import COMPUTED
 from hil.realtime.durations import percentiles
 from hil.runs.config import SimulationConfig
@@ -299,26 +298,24 @@ def _of_simulation(source: str, content: dict[str, Any]) -> _Loaded:
     figures = {
         f"{group}.{name}": value
         for group in ("estimation", "tracking", "protection")
-        for name, value in (content[group] or {}).items()
+        for name, value in (content.get(group) or {}).items()
     }
     figures |= {f"compute.{name}": 1e-6 * us for name, us in content["cycle_us"].items()}
-    figures |= {"target_stretch": content["target_stretch"], "events": len(content["events"])}
-    config = _config(content["config"])
+    figures |= _common(content)
+    config = _config(content["config"] | _stages(content))
     seconds = content.get("motion_s", config["duration"])
     return _Loaded(source, "simulation", str(content["version"]), config, seconds, tuple(content["events"]), figures)
 
 
 def _of_run(source: str, content: dict[str, Any]) -> _Loaded:
-    errors, timing, config = content["errors_m"], content["timing_us"], _config(content["config"])
+    errors, timing, config = content["errors_m"], content["timing_us"], _config(content["config"] | _stages(content))
     figures = _with_the_hold(errors, content.get("errors_rad", {}))
-    figures |= {f"protection.{name}_max": value for name, value in (content["protection"] or {}).items()}
+    figures |= {f"protection.{name}_max": value for name, value in (content.get("protection") or {}).items()}
     for group, stage in (("compute", "compute"), ("late", "wake")):
         figures |= {f"{group}.{name}": 1e-6 * timing[stage][name] for name in _TIMES}
     figures["missed_periods"] = sum(content[f"missed_{cause}"] for cause in ("own", "late", "host"))
-    figures |= {"target_stretch": content["target_stretch"], "events": len(content["events"])}
-    seconds = config["duration"]
-    if content["cause"] != Cause.END_OF_MOTION.text:
-        seconds = min(seconds, content["cycles"] / config["rate"])
+    figures |= _common(content)
+    seconds = content.get("motion_s", config["duration"])
     return _Loaded(source, "run", str(content["version"]), config, seconds, tuple(content["events"]), figures)
 
 
@@ -335,6 +332,16 @@ def _of_recording(source: str, run: RecordedRun) -> _Loaded:
     return _Loaded(source, "recording", str(run.config["version"]), _config(run.config), seconds, events, figures, run)
 
 
+def _common(content: Mapping[str, Any]) -> dict[str, float]:
+    """The figures that simulations and runs tell alike; an older version told no stretch."""
+    stretch = {"target_stretch": content["target_stretch"]} if "target_stretch" in content else {}
+    return {**stretch, "events": len(content["events"])}
+
+
+def _stages(content: Mapping[str, Any]) -> dict[str, Any]:
+    return {"stages": content.get("stages", {})}
+
+
 def _with_the_hold(errors: Mapping[str, float], rotation: Mapping[str, float]) -> dict[str, float]:
     """The figures of the errors that a run sums up; an older version did not tell that of the rotation."""
     figures = {"whole.lengths": errors["tracking"]}
@@ -345,9 +352,11 @@ def _with_the_hold(errors: Mapping[str, float], rotation: Mapping[str, float]) -
 
 
 def _config(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a configuration as JSON has them; an older version may lack some, which then have their defaults."""
-    plain = json.loads(json.dumps(asdict(SimulationConfig())))
-    return {each.name: values.get(each.name, plain[each.name]) for each in fields(SimulationConfig)}
+    """The fields of a configuration as JSON has them, and the stages of the user's own; an older version may lack some, which
+    then have their defaults.
+    """
+    plain = json.loads(json.dumps(asdict(SimulationConfig()))) | {"stages": {}}
+    return {name: values.get(name, default) for name, default in plain.items()}
 
 
 def _course(run: RecordedRun, rows: NDArray[np.intp]) -> Course:

@@ -20,7 +20,7 @@ from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
 from plant.mechanism import Mechanism
 from plant.pose import UNIT_TOLERANCE, Array, pose_errors, quaternion_from_rotation, rotations_from_quaternions
-from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
+from plant.truth import TRUTH_CURRENTS, TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION, pose_known
 
 AXES, QUATERNION, TWIST = ("x", "y", "z"), ("w", "x", "y", "z"), ("x", "y", "z", "rx", "ry", "rz")
 
@@ -164,7 +164,7 @@ def _of_records(records: Record, times: Array, legs: int) -> xr.Dataset:
         values = values[:, :legs] if each.dimensions[:1] == ("leg",) else values
         made[name] = (("time", *each.dimensions), values, {"units": each.unit, "long_name": each.text})
     truth = records["truth"]
-    if np.isfinite(truth[:1, TRUTH_QUATERNION]).all():
+    if pose_known(truth).any():
         rotations = rotations_from_quaternions(np.ascontiguousarray(truth[:, TRUTH_QUATERNION]))
         errors = pose_errors(records["position"], records["rotation"], truth[:, TRUTH_POSITION], rotations)
         made["position_error"] = _of_axes(errors[:, :3], "estimate less truth")

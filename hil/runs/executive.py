@@ -45,8 +45,8 @@ from hil.rigs import Rig
 from hil.rigs.udp.link import parse_address
 from hil.rigs.udp.rig import UdpRig
 from hil.runs.channel_process import channel_process
-from hil.runs.config import SimulationConfig
-from hil.runs.prepare import demands_of, prepared_loop, rig_of
+from hil.runs.config import PYTHON_RIG, SimulationConfig
+from hil.runs.prepare import PreparedLoop, demands_of, prepared_loop, rig_of
 from hil.runs.recorders import Recorders, claimed
 from hil.runs.run_state import RunState
 from hil.runs.target_stream import HOST, PORT, open_socket, receive
@@ -96,8 +96,8 @@ def run(
         The summary: `cause` of the stop, `cycles`, missed periods by cause and most in a row, `timing_us` and which of it is
         `over_budget`, `target_stretch` (`controller.planning.pace`), `errors_m` and `errors_rad`, the number of cycles `unseen`
         by these, `usage` of the loop's thread, `start_up_s`, `recording` (files, cycles lost), `remarks`, `refused`, `events`,
-        `config`, `version`; of a rig on a bus `identity`, `late` exchanges, `refused_packets` and `round_trip_bars`; and of a
-        dry run the `obstacle` to arming, "" if there is none.
+        `motion_s`, for how long the motion was followed, `stages`, `config`, `version`; of a rig on a bus `identity`, `late`
+        exchanges, `refused_packets` and `round_trip_bars`; and of a dry run the `obstacle` to arming, "" if there is none.
 
     Raises:
         GoughError: something in the configuration or the settings cannot be used; nothing has run.
@@ -105,6 +105,7 @@ def run(
     """
     if config.fusion == "filterpy":
         raise InputError("the filters of filterpy are too slow for the clock: use them with 'gough simulate'")
+    stages = stages or Stages()
     records = shared_array(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
     link: NDArray[np.int64] = shared_array(LINK_SIZE, np.dtype(np.int64))
     link[Link.SUPERVISOR] = os.getpid()
@@ -120,7 +121,7 @@ def run(
         recorders = Recorders(recording, records, link, ours, state.events)
         at_end.enter_context(_reported(state, recorders))
         at_end.callback(recorders.finish)
-        loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream, stages or Stages())
+        loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream, stages)
         theirs.close()
         leftovers: list[Path | None] = []
         at_end.callback(_end, loop, link, leftovers)
@@ -131,9 +132,11 @@ def run(
         recorders.start(header)
         with contextlib.suppress(BrokenPipeError):
             ours.send("go")
+        # A user's code in the loop may never return.
+        in_python = bool(stages.names) or rig is not None or config.rig.startswith(PYTHON_RIG)
         answered = time.monotonic()
         while not ours.poll(_LOOK_S) and loop.is_alive():
-            if state.update(records, link) or not link[Link.STOP]:
+            if state.update(records, link) or link[Link.DONE] or not (in_python or link[Link.STOP]):
                 answered = time.monotonic()
             elif time.monotonic() - answered > PATIENCE_S:
                 state.events.append(f"the loop has not answered for {PATIENCE_S:g} s and was killed: the rig brakes by itself")
@@ -310,12 +313,21 @@ def _prepare_and_follow(
             **{name: int(loop.clock[name]) for name in ("missed_late", "missed_own", "missed_host")},
             "missed_in_a_row": int(loop.clock["most_in_a_row"]),
             "remarks": list(loop.remarks),
+            "stages": stages.names,
+            "motion_s": _seconds_of_motion(loop, config.duration),
             "usage": used,
             "identity": header["config"].get("identity"),
             "target_stretch": 1.0 if config.streamed else least_time_scale(loop.mechanism, loop.target, 1.0),
             "obstacle": None if config.arm else describe_obstacle(loop.state),
         }
         pipe.send((cause, int(loop.state["safety"]["stop"]["cycle"]), int(loop.clock["start"]), figures))
+
+
+def _seconds_of_motion(loop: PreparedLoop, duration: float) -> float:
+    """For how long a run that has ended followed its motion [s]."""
+    stop = loop.state["safety"]["stop"]
+    seconds = (int(stop["cycle"]) - loop.cycle_at(0.0)) * float(loop.parameters["rig"]["period"])
+    return min(max(seconds, 0.0), duration)
 
 
 def _summary(

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.direct_kinematics import poses_from_lengths
-from controller.frames import ActiveFrames, parse_frames
+from controller.frames import LEVEL, ActiveFrames, parse_frames
 from controller.imu_set import imus_of
 from controller.safety.causes import Mode
 from controller.workspace import Demands
@@ -20,7 +21,7 @@ from plant.compiled import Record
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism, load_in_space
 from plant.pose import Array, Pose, rotations_from_quaternions
-from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
+from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION, pose_known
 
 _EVENTS = 8
 _AT_START_M = 1e-10
@@ -53,7 +54,7 @@ class RecordedRun:
         """From the first cycle to the last [s]."""
         return float(self.records["cycle"][-1] - self.records["cycle"][0]) * self.period
 
-    @property
+    @cached_property
     def times(self) -> Array:
         """The times (N,) [s]; 0 is where the motion begins, after the hold and the approach to its start. NaN without one."""
         motion = self.motion
@@ -61,9 +62,11 @@ class RecordedRun:
         times: Array = (self.records["cycle"] - begin) * self.period
         return times
 
-    @property
+    @cached_property
     def motion(self) -> NDArray[np.intp]:
-        """The places of the motion's records: from its beginning until it ends or is stopped."""
+        """The places of the motion's records: from its beginning until it ends or is stopped. In the level frame, in which no
+        reference rests, it begins with the approach.
+        """
         running = np.flatnonzero(self.records["mode"] == Mode.RUNNING)
         if not len(running):
             return running
@@ -71,12 +74,14 @@ class RecordedRun:
         references = self.records["reference"][:, : self.mechanism.legs, 0]
         start = references[max(running[0] - 1, 0)]
         arrived = np.abs(references[running] - start).max(axis=1) < _AT_START_M
+        if LEVEL in (self.config.get("frame"), self.frames.root):
+            return running
         return running[np.argmax(arrived) :] if arrived.any() else running[:0]
 
     @property
     def truth_known(self) -> bool:
         """Whether the rig gives its true pose, if only from some cycle on."""
-        return bool(np.isfinite(self.records["truth"][:, :7]).all(axis=1).any())
+        return bool(pose_known(self.records["truth"]).any())
 
     def estimates(self, rows: NDArray[np.intp]) -> tuple[Array, Array]:
         """The estimated positions (n, 3) [m] and rotations (n, 3, 3) of records."""
@@ -107,7 +112,8 @@ class RecordedRun:
     def state(self, index: int) -> dict[str, Any]:
         """The state at a record, as a run tells it; its reference is `commanded`."""
         record = self.records[index]
-        told = {"time": index * self.period, **state_message(record, self.frames)}
+        seconds = float(record["cycle"] - self.records["cycle"][0]) * self.period
+        told = {"time": seconds, **state_message(record, self.frames)}
         recent = np.arange(max(index - round(1.0 / self.period), 0), index + 1)
         told["timing"] = timing_message(self.records, recent, self.period)
         reference = reference_pose(record, self.mechanism)

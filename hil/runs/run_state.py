@@ -12,7 +12,7 @@ from hil.loop.stage_times import Timing
 from hil.recording.mcap import events_of, take
 from plant.compiled import Record
 from plant.pose import pose_errors, rotations_from_quaternions
-from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
+from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION, pose_known
 
 _MOST_EVENTS = 100
 
@@ -81,7 +81,7 @@ class RunState:
             self.protection = np.fmax(self.protection, np.fmax.reduce(records["protection"][moving].astype(float)))
         # Before the rig is armed there may be cycles without a pose.
         posed = records[records["status"] == 0]
-        known = posed[np.isfinite(posed["truth"][:, 0])]
+        known = posed[pose_known(posed["truth"])]
         errors = posed["lengths"] - posed["reference"][:, :, 0]
         self._tracking_squares += float((np.sum(errors**2, axis=1) / np.count_nonzero(posed["lengths"], axis=1)).sum())
         if len(known):

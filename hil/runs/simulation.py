@@ -31,7 +31,7 @@ from plant.dynamics.base_course import attitudes_of, displacements_of, placed
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array, Pose, pose_errors, rms_figures, rotations_from_quaternions
-from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
+from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION, pose_known
 
 Poses = tuple[Array, Array]
 """Positions (N, 3) [m] and rotations (N, 3, 3)."""
@@ -103,7 +103,7 @@ class SimulationResult:
     @property
     def truth_known(self) -> bool:
         """Whether the plant gives its true pose."""
-        return bool(np.isfinite(self.records["truth"][:1, :7]).all())
+        return bool(pose_known(self.records["truth"][:1]).all())
 
     @property
     def true_positions(self) -> Array:
@@ -268,6 +268,9 @@ class Simulation:
         if self._cause != Cause.NONE:
             raise _stopped(loop, self.result(), self._cause) from loop.error
         loop.compute(CycleStage.SCREENING, CycleStage.WATCH, self._replacements)
+        for each in self._replacements:
+            if each.before == CycleStage.WATCH:
+                loop.replace(each)
         self._sensed = True
         return self.cycle
 
@@ -275,18 +278,21 @@ class Simulation:
         """End the cycle.
 
         Args:
-            command: velocity of each drive (L,) [m/s] in place of gough's, cut off at the largest command. It counts while
-                `cycle.driving`.
+            command: velocity of each drive (L,) [m/s] in place of gough's or a stage's, cut off at the largest command. It is
+                for a platform that follows its motion (`cycle.driving`).
 
         Raises:
             InputError: the command is malformed, or no cycle has been sensed.
+            SimulationStoppedError: the motion is over, and a stop is still under way.
         """
         if not self._sensed:
             raise InputError("no cycle has been sensed: call sense() first")
         if command is not None:
             replace_command(self._loop.parameters, self._loop.state, self.cycle, command)
-        self._loop.finish(CycleStage.WATCH, self._replacements)
+        self._loop.finish(CycleStage.WATCH)
         self._sensed = False
+        if self.ended and self._loop.state["safety"]["stop"]["cause"] != Cause.NONE:
+            raise _stopped(self._loop, self.result(), Cause.NONE) from self._loop.error
 
     def step(self, command: ArrayLike | None = None) -> Cycle:
         """One cycle: `sense`, then `act`."""

@@ -19,7 +19,7 @@ from plant.compiled import Record
 from plant.imu_wiring import IMU_COUNT
 from plant.mechanism import Mechanism
 from plant.pose import Pose, rotations_from_quaternions
-from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION
+from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION, pose_known
 
 
 def machine_message(mechanism: Mechanism) -> dict[str, Any]:
@@ -56,7 +56,7 @@ def state_message(record: Record, frames: ActiveFrames) -> dict[str, Any]:
     if pose is not None:
         told |= {"pose": pose_message(pose), **_tool_message(frames, pose)}
     truth = record["truth"]
-    if np.isfinite(truth[:7]).all():
+    if pose_known(truth):
         true = Pose(truth[TRUTH_POSITION], rotations_from_quaternions(truth[None, TRUTH_QUATERNION])[0])
         told["truth"] = pose_message(true)
     return told

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from controller.cycle import prepare_next, react, skip_periods
+from controller.planning.plan_handover import rest
 from controller.safety.causes import Cause, Mode, Request
 from controller.safety.stop import STOP_SETTLING_S, describe_end, has_stopped, stop_parameters
 from plant.mechanism import Limits
@@ -46,7 +47,7 @@ def test_after_missed_periods_a_stop_begins_where_the_last_commands_have_led(pre
     motion[legs:] = 0.0
     state["reference"]["motion"], state["pid"]["command"] = motion, COMMANDS
     state["reference"]["index"], state["reference"]["due_cycle"] = 3, CYCLE
-    state["time"]["missed"] = missed
+    state["time"]["missed"] = state["time"]["behind"] = missed
     ask(parameters, state, Cause.STOP_REQUESTED)
     assert (state["safety"]["mode"], state["safety"]["request"]) == (Mode.STOPPING, Request.ENABLED)
     stop, segments = state["safety"]["stop"], state["safety"]["stop"]["segments"]
@@ -77,10 +78,22 @@ def test_without_missed_periods_a_stop_goes_on_from_the_reference():
     np.testing.assert_allclose(state["reference"]["motion"][:, 0], gone, rtol=0.0, atol=60.0 * PERIOD_S**3)
 
 
+def test_when_the_reference_is_of_the_present_a_stop_goes_on_from_it_although_periods_were_missed():
+    _, parameters, state = moving()
+    state["pid"]["command"] = COMMANDS
+    skip_periods(state, 3)
+    # As every cycle does, unless a stop has begun before.
+    prepare_next(parameters, state, rest(np.full(6, 0.4)))
+    motion = state["reference"]["motion"].copy()
+    ask(parameters, state, Cause.FOLLOWING_ERROR)
+    np.testing.assert_array_equal(state["safety"]["stop"]["segments"][:, 0, 1:4], motion)
+
+
 @pytest.mark.parametrize("mode", [Mode.IDLE, Mode.ARMED])
 def test_before_the_motion_a_stop_is_the_brakes_at_once(mode):
     _, parameters, state = moving(mode=mode, request=Request.ENABLED if mode == Mode.ARMED else Request.BRAKED)
-    state["time"]["missed"], state["pid"]["command"] = 3, COMMANDS
+    state["time"]["missed"] = state["time"]["behind"] = 3
+    state["pid"]["command"] = COMMANDS
     ask(parameters, state, Cause.STOP_REQUESTED)
     assert (state["safety"]["mode"], state["safety"]["request"]) == (Mode.STOPPING, Request.BRAKED)
     assert not state["reference"]["motion"].any()

@@ -1,5 +1,6 @@
 """Stages of the user's own: they stand in place of gough's, are checked as these are, and fail safely."""
 
+import sys
 import time
 from dataclasses import fields, replace
 from itertools import pairwise
@@ -259,6 +260,7 @@ def test_stages_run_on_the_clock_and_a_replay_says_that_it_lacks_them(tmp_path):
     recording = tmp_path / "own.mcap"
     summary = run(config, settings, recording, stages=stages)
     assert summary["cause"] == "end of the motion" and summary["errors_m"]["tracking"] < 1e-3
+    assert summary["motion_s"] == pytest.approx(config.duration) and list(summary["stages"]) == ["command"]
     with pytest.raises(RecordingError, match="stages of its own, command"):
         replay([recording])
 
@@ -269,4 +271,87 @@ def test_a_stage_that_fails_on_the_clock_ends_the_run_by_a_quick_stop():
         raise ValueError("no gains")
 
     with pytest.raises(RunStoppedError, match="a stage in Python has failed: ValueError: no gains"):
+        run(replace(CONFIG, rate=100.0), RealTimeSettings(most_missed=1000), stages=Stages(command=command))
+
+
+def test_a_controlled_stop_is_goughs_whatever_the_function_commands():
+    """A function that never looks at the reference drives on; the stop that its limits cause ends at rest all the same."""
+    config = replace(CONFIG, target="hold", imu="ideal", duration=3.0)
+    with pytest.raises(SimulationStoppedError, match="does not follow its reference") as caught:
+        simulate(config, stages=Stages(command=lambda cycle: np.full(6, 0.05 * (cycle.time > 0.1))))
+    records = caught.value.result.records
+    stopping = records[records["mode"] == Mode.STOPPING]
+    off = np.abs(stopping["truth"][:, 7:13] - stopping["reference"][:, :, 0]).max(axis=1)
+    assert off[0] > 0.01 and off[-1] < 1.5e-3 and np.abs(stopping["command"][-1]).max() < 0.02
+
+
+def test_a_leg_whose_imu_is_left_out_has_no_direction():
+    seen = {}
+
+    def pose(cycle):
+        seen[cycle.time > 0.05] = cycle.directions
+        return Pose(cycle.position, cycle.rotation)
+
+    simulate(replace(CONFIG, duration=1.0, faults=("imu-turn:3,axis=x,size_deg=2,at=0.2",)), stages=Stages(pose=pose))
+    assert np.isfinite(seen[False]).all() and len(seen) == 2
+    assert np.isnan(seen[True]).any(axis=1).tolist() == [False, False, False, True, False, False]
+
+
+def test_a_direction_that_is_given_counts_although_the_legs_imu_is_left_out():
+    def directions(cycle):
+        return inverse_kinematics(HEXAPOD, true_pose(cycle)).directions
+
+    result = simulate(replace(CONFIG, duration=1.0, faults=("imu-turn:3,axis=x,size_deg=2,at=0.2",)), stages=Stages(directions))
+    assert np.isfinite(result.records["residuals"][-1]).all()
+    assert result.summary()["estimation"]["position_rms"] < 1.5e-4
+
+
+def test_of_two_stages_that_fail_the_first_is_told():
+    def failing(name):
+        def stage(cycle):
+            if cycle.time > 0.1:
+                raise ValueError(name)
+            return {"pose": Pose(cycle.position, cycle.rotation), "command": cycle.command}[name]
+
+        return stage
+
+    with pytest.raises(SimulationStoppedError, match=r"ValueError: pose$"):
+        simulate(CONFIG, stages=Stages(pose=failing("pose"), command=failing("command")))
+    with pytest.raises(SimulationStoppedError, match="SystemExit: 3"):
+        simulate(CONFIG, stages=Stages(command=lambda cycle: sys.exit(3)))
+
+
+def test_a_malformed_pose_leaves_nothing_of_it_behind():
+    with open_simulation(CONFIG, Stages(pose=lambda cycle: Pose(np.full(3, 7.0), 2.0 * np.eye(3)))) as simulation:
+        simulation.sense()
+        assert np.abs(simulation.cycle.position).max() < 1.0
+
+
+def test_a_stepped_loop_shows_the_stages_command_and_takes_another_one():
+    stages = Stages(command=lambda cycle: np.full(6, 0.003))
+    with open_simulation(replace(CONFIG, target="hold", imu="ideal"), stages) as simulation:
+        while not simulation.cycle.driving:
+            simulation.step()
+        np.testing.assert_array_equal(simulation.sense().command, np.full(6, 0.003))
+        simulation.act(np.full(6, 0.002))
+        np.testing.assert_array_equal(simulation.cycle.command, np.full(6, 0.002))
+
+
+def test_a_stop_that_is_under_way_at_the_end_is_told_when_stepping():
+    stages = Stages(command=lambda cycle: np.full(6, np.nan if cycle.time > 0.59 else 0.0))
+    with open_simulation(replace(CONFIG, target="hold"), stages) as simulation:
+        with pytest.raises(SimulationStoppedError, match=r"still stopping at the end, from.*the command"):
+            while not simulation.ended:
+                simulation.step()
+        assert simulation.ended
+
+
+@pytest.mark.slow(seconds=20)
+def test_a_stage_that_never_returns_is_ended():
+    def command(cycle):
+        if cycle.time > 0.1:
+            time.sleep(600.0)
+        return cycle.command
+
+    with pytest.raises(RunStoppedError, match="has not answered for 10 s and was killed"):
         run(replace(CONFIG, rate=100.0), RealTimeSettings(most_missed=1000), stages=Stages(command=command))

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from controller.safety.causes import Mode
 from hil import compare
 from hil.command_line.cli import write_json
 from hil.look import SERIES
@@ -17,6 +18,7 @@ from hil.recording.mcap import RecordingError, read
 from hil.runs.comparison import FIGURES
 from hil.runs.config import SimulationConfig
 from hil.runs.executive import run
+from hil.runs.recorded_run import recorded_run
 from hil.runs.simulation import simulate
 from plant.errors import InputError
 from plant.mechanism import load_mechanism
@@ -105,6 +107,38 @@ def test_the_figures_are_those_of_the_recording_over_the_shared_time(compared, f
         assert made.figures[name] == pytest.approx(value, rel=1e-6, abs=1e-9), name
     assert made.seconds == compared.seconds == pytest.approx(0.6)
     assert len(made.course.times) == len(records) and made.course.times[0] == 0.0
+
+
+def test_runs_that_differ_in_their_stages_alone_differ_in_these(folder, tmp_path):
+    told = json.loads((folder / "simulated.json").read_text())
+    own = told | {"stages": {"command": "mine.proportional"}}
+    for name, content in (("goughs.json", told), ("mine.json", own)):
+        (tmp_path / name).write_text(json.dumps(content))
+    differing = compare([tmp_path / "goughs.json", tmp_path / "mine.json"]).differing()
+    assert differing == {"stages": [{}, {"command": "mine.proportional"}]}
+
+
+def test_a_json_of_an_older_version_lacks_some_figures_and_is_taken(folder, tmp_path):
+    told = json.loads((folder / "long.json").read_text())
+    older = {
+        name: value for name, value in told.items() if name not in ("protection", "target_stretch", "errors_rad", "motion_s")
+    }
+    (tmp_path / "older.json").write_text(json.dumps(older))
+    run = compare([folder / "long.json", tmp_path / "older.json"]).runs[1]
+    assert "target_stretch" not in run.figures and "whole.rotation" not in run.figures
+    assert run.figures["whole.estimation"] == told["errors_m"]["estimation"]
+
+
+def test_in_the_level_frame_the_motion_begins_with_the_approach(folder):
+    """There the base moves the reference, which never rests at the start."""
+    run = recorded_run([folder / "long.mcap"])
+    moved = run.records.copy()
+    moved["reference"][:, :, 0] += 1e-4 * np.sin(0.01 * np.arange(len(moved)))[:, None]
+    assert not len(replace(run, records=moved).motion)
+    level = replace(run, records=moved, config={**run.config, "frame": "level"})
+    running = np.flatnonzero(moved["mode"] == Mode.RUNNING)
+    np.testing.assert_array_equal(level.motion, running)
+    assert level.times[running[0]] == 0.0 and level.duration == run.duration
 
 
 def test_what_was_written_of_a_run_is_taken_as_it_is(compared, folder):
