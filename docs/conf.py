@@ -36,6 +36,8 @@ html_theme = "furo"
 html_title = "gough"
 html_math_renderer = "mathml"
 html_copy_source = False
+html_static_path = ["_static"]
+html_css_files = ["gough.css"]
 html_show_copyright = False
 
 linkcheck_timeout = 20
