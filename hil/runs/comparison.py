@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from hil.loop.records import COMPUTED
 from hil.realtime.durations import percentiles
 from hil.runs.config import SimulationConfig
+from hil.runs.figures import error_figures, level_figures
 from hil.runs.recorded_run import RecordedRun, recorded_run
 from hil.runs.run_state import RunState
 from hil.table import Cell, Table
 from plant.errors import InputError
 from plant.files import read_text
-from plant.pose import Array, pose_errors, rms_figures
+from plant.pose import Array, pose_errors
 
 _MCAP = b"\x89MCAP"
 _TIMES = ("p50", "p99", "p999")
@@ -381,15 +382,11 @@ def _recorded_figures(run: RecordedRun, course: Course, rows: NDArray[np.intp]) 
     for group, errors in (("estimation", course.estimation), ("tracking", course.tracking)):
         known = errors[np.isfinite(errors).all(axis=1)]
         if len(known):
-            largest = np.linalg.norm(known.reshape(-1, 2, 3), axis=2).max(axis=0)
-            found = rms_figures(known) | {"position_max": largest[0], "rotation_max": largest[1]}
-            figures |= {f"{group}.{name}": value for name, value in found.items()}
+            figures |= {f"{group}.{name}": value for name, value in error_figures(known).items()}
     levels = run.records["protection"][rows].astype(float)
     levels = levels[np.isfinite(levels).all(axis=1)]
     if len(levels):
-        for kind, share in (("p50", 0.5), ("p99", 0.99), ("max", 1.0)):
-            position, rotation = np.quantile(levels, share, axis=0)
-            figures |= {f"protection.position_{kind}": position, f"protection.rotation_{kind}": rotation}
+        figures |= {f"protection.{name}": value for name, value in level_figures(levels).items()}
     for group, times in (("compute", course.compute), ("late", course.late)):
         figures |= {f"{group}.{name}": 1e-6 * us for name, us in percentiles(1e9 * times, _TIMES).items()}
     figures["missed_periods"] = int(run.records["missed"][rows].sum())

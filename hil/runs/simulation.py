@@ -23,6 +23,7 @@ from hil.loop.records import COMPUTED
 from hil.progress import Progress, Say, no_progress, say_nothing
 from hil.realtime.durations import QUANTILES, percentiles
 from hil.runs.config import SimulationConfig
+from hil.runs.figures import error_figures, level_figures
 from hil.runs.prepare import PreparedLoop, prepared_loop
 from hil.runs.run_state import note_events
 from hil.runs.snapshot import Snapshot, resume_snapshot, take_snapshot
@@ -30,7 +31,7 @@ from plant.compiled import Record
 from plant.dynamics.base_course import attitudes_of, displacements_of, placed
 from plant.errors import GoughError, InputError
 from plant.mechanism import Mechanism
-from plant.pose import Array, Pose, pose_errors, rms_figures, rotations_from_quaternions
+from plant.pose import Array, Pose, pose_errors, rotations_from_quaternions
 from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION, pose_known
 
 Poses = tuple[Array, Array]
@@ -410,11 +411,7 @@ def _protection(levels: Array, poses: dict[str, Poses]) -> dict[str, float] | No
     known = np.isfinite(levels[:, 0])
     if not known.any():
         return None
-    figures = {
-        f"{name}_{label}": float(np.quantile(levels[known, part], share))
-        for part, name in enumerate(("position", "rotation"))
-        for label, share in (("p50", 0.5), ("p99", 0.99), ("max", 1.0))
-    }
+    figures = level_figures(levels[known])
     if "truth" not in poses:
         return figures
     sizes = np.linalg.norm(pose_errors(*poses["estimate"], *poses["truth"]).reshape(-1, 2, 3), axis=2)
@@ -424,6 +421,4 @@ def _protection(levels: Array, poses: dict[str, Poses]) -> dict[str, float] | No
 def _figures(poses: Poses, true: Poses, known: NDArray[np.bool_] | None = None) -> dict[str, float]:
     """RMS and largest errors of poses, positions (N, 3) and rotations (N, 3, 3), of those that are `known`."""
     errors = pose_errors(*poses, *true)
-    errors = errors if known is None else errors[known]
-    largest = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).max(axis=0)
-    return rms_figures(errors) | {"position_max": float(largest[0]), "rotation_max": float(largest[1])}
+    return error_figures(errors if known is None else errors[known])
