@@ -43,7 +43,7 @@ from hil.runs.telemetry import (
 )
 from plant.checks import printable
 from plant.compiled import Record
-from plant.errors import GoughError, InputError
+from plant.errors import GoughError, InputError, PlanningError
 
 TELEMETRY_HZ = 30.0
 
@@ -309,9 +309,11 @@ class _Channel:
 
     def _end(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client, request
-        if self._platform is not None:
-            self._platform.stop()
         self._link[Link.STOP] = max(int(self._link[Link.STOP]), StopRequest.CONTROLLED)
+        if self._platform is not None:
+            # The loop comes to rest without it, too.
+            with suppress(PlanningError):
+                self._platform.stop()
         return {}
 
     def _emergency(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:

@@ -11,9 +11,12 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from ruckig import ControlInterface
+
 from controller.frames import ActiveFrames, Frames
 from controller.frames.tree import Frame
 from controller.inverse_kinematics import leg_lengths
+from controller.planning import straight_way
 from controller.planning.plan_handover import STREAM, STREAM_READER, rest, stream_cause, take_plan
 from controller.planning.points import load_points
 from controller.planning.segments import evaluate_reference
@@ -471,6 +474,25 @@ def test_one_operator_at_a_time_and_observers_who_give_no_orders(hexapod):
         operator.close()
         time.sleep(0.2)
         run.operator().close()
+
+
+def test_a_run_ends_when_it_is_told_to_though_its_move_cannot_be_stopped(hexapod, monkeypatch):
+    """The channel's process plans with a ruckig that refuses all stops."""
+    planned = straight_way.calculate
+
+    def without_stops(otg, parameters, state, trajectory):
+        if parameters.control_interface == ControlInterface.Velocity:
+            parameters.max_jerk = [-1.0]
+        return planned(otg, parameters, state, trajectory)
+
+    monkeypatch.setattr(straight_way, "calculate", without_stops)
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        operator.move({"position": [0.03, 0.0, 0.0]}, speed=0.03, wait=False)
+        with pytest.raises(RequestRefusedError, match="ruckig finds no way"):
+            operator.stop()
+        operator.end()
+        assert run.link[Link.STOP] == StopRequest.CONTROLLED
 
 
 def said(address, *lines):
