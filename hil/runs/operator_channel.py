@@ -151,57 +151,50 @@ class _Channel:
     # ------------------------------------------------------------------------------------------------------------ clients
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._waiting + len(self._clients) >= MOST_CLIENTS:
-            writer.close()
-            return
-        self._waiting += 1
+        client = None
         try:
             client = await self._greeted(reader, writer)
-        finally:
-            self._waiting -= 1
-        if client is None:
-            writer.close()
-            return
-        try:
-            while line := await reader.readline():
-                writer.write(encode(self._answer(client, line)))
+            if client is not None:
+                writer.write(encode({"gough": VERSION, "ok": True, **self._described()}))
                 await writer.drain()
-                # Between two requests the platform goes on, however many wait.
-                await asyncio.sleep(0)
-        except (OSError, ValueError):
-            # It has gone, or its line has no end.
+                while line := await _line(reader):
+                    writer.write(encode(self._answer(client, line)))
+                    await writer.drain()
+                    # Between two requests the platform goes on, however many wait.
+                    await asyncio.sleep(0)
+        except OSError:
+            # It has gone.
             pass
         finally:
-            self._clients.remove(client)
-            if client.role == OPERATOR and self._platform is not None:
-                self._platform.lose_operator()
+            if client is not None:
+                self._clients.remove(client)
+                if client.role == OPERATOR and self._platform is not None:
+                    self._platform.lose_operator()
             writer.close()
 
     async def _greeted(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> _Client | None:
-        """A client that may stay."""
-        kind, error, client = "malformed", "", None
-        try:
-            hello = decode(await asyncio.wait_for(reader.readline(), _HELLO_S))
-            kind, error = self._refusal(hello)
-            if not error:
-                client = _Client(writer, printable(str(hello.get("name", "")))[:80] or "somebody", str(hello["role"]))
-                # Before anything else is waited for, so that there is one operator.
-                self._clients.append(client)
-        except (GoughError, ValueError) as refusal:
-            error = str(refusal)
-        except (OSError, TimeoutError):
+        """A client that may stay, which has its place from here on; another one is told why not."""
+        if self._waiting + len(self._clients) >= MOST_CLIENTS:
             return None
-        answer = {"gough": VERSION, "ok": client is not None}
-        with suppress(OSError):
-            writer.write(encode(answer | (self._described() if client is not None else {"kind": kind, "error": error})))
-            await writer.drain()
-        if client is not None and client.role == OPERATOR:
-            connection = writer.get_extra_info("socket")
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            # Of an operator whose machine has gone without a word, too, the place becomes free.
-            for option, value in (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3)):
-                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        self._waiting += 1
+        kind, error, hello = "malformed", "", dict[str, Any]()
+        try:
+            hello = decode(await asyncio.wait_for(_line(reader), _HELLO_S))
+            kind, error = self._refusal(hello)
+        except GoughError as refusal:
+            error = str(refusal)
+        except TimeoutError:
+            return None
+        finally:
+            self._waiting -= 1
+        if error:
+            writer.write(encode({"gough": VERSION, "ok": False, "kind": kind, "error": error}))
+            return None
+        client = _Client(writer, printable(str(hello.get("name", "")))[:80] or "somebody", str(hello["role"]))
+        if client.role == OPERATOR:
+            _watch_over(writer.get_extra_info("socket"))
+        # Before anything else is waited for, so that there is one operator.
+        self._clients.append(client)
         return client
 
     def _refusal(self, hello: dict[str, Any]) -> tuple[str, str]:
@@ -398,6 +391,22 @@ class _Channel:
             self._timed = done
             self._last_timing = timing_message(self._records, np.arange(done - count, done) % size, self._period)
         return self._last_timing
+
+
+async def _line(reader: asyncio.StreamReader) -> bytes:
+    """The next line of a client; b"" if it has gone, or its line has no end."""
+    try:
+        return await reader.readline()
+    except (OSError, ValueError):
+        return b""
+
+
+def _watch_over(connection: socket.socket) -> None:
+    """Let an operator's requests come at once, and its place become free if its machine goes without a word."""
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    for option, value in (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3)):
+        connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
 
 def _name_in(request: dict[str, Any], name: str) -> str | None:

@@ -1,10 +1,12 @@
 """An operator over real sockets: the channel in a process of its own, and a loop on the clock that follows its plans."""
 
+import asyncio
 import json
 import multiprocessing
 import os
 import signal
 import socket
+import struct
 import time
 from contextlib import contextmanager
 
@@ -26,7 +28,7 @@ from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
 from hil.runs.channel_process import open_channel
 from hil.runs.operated_platform import DEADMAN_S, OperatedPlatform, Workplace
 from hil.runs.operator import Operator, RequestRefusedError
-from hil.runs.operator_channel import serve_channel
+from hil.runs.operator_channel import _Channel, serve_channel
 from hil.runs.operator_messages import VERSION, ChannelError, channel_address, decode, encode, load_token
 from plant.errors import InputError
 from plant.mechanism import load_in_space
@@ -493,6 +495,43 @@ def test_a_run_ends_when_it_is_told_to_though_its_move_cannot_be_stopped(hexapod
             operator.stop()
         operator.end()
         assert run.link[Link.STOP] == StopRequest.CONTROLLED
+
+
+def test_a_client_that_resets_the_connection_while_it_is_greeted_keeps_no_place(hexapod):
+    """At each turn of the event loop, from the one in which its greeting is sent."""
+    link, records = np.zeros(LINK_SIZE, np.int64), np.zeros(8, RECORD)
+    workplace = Workplace(hexapod, ActiveFrames(Frames()), Demands(), {})
+    channel = _Channel(None, workplace, "circle", None, PERIOD, records, link)
+    hello = encode({"gough": VERSION, "role": "operator"})
+
+    async def greeted(address):
+        """Whether the operator's place is free soon."""
+        for _ in range(100):
+            reader, writer = await asyncio.open_connection(*address)
+            writer.write(hello)
+            ok = decode(await reader.readline())["ok"]
+            writer.close()
+            if ok:
+                return True
+            await asyncio.sleep(0.01)
+        return False
+
+    async def greet_and_reset(listener):
+        serving, address = asyncio.create_task(channel.run(listener)), listener.getsockname()
+        for turns in range(12):
+            with socket.create_connection(address) as raw:
+                # It is accepted meanwhile.
+                await asyncio.sleep(0.01)
+                raw.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                raw.sendall(hello)
+                for _ in range(turns):
+                    await asyncio.sleep(0)
+            assert await greeted(address), f"reset after {turns} turns"
+        link[Link.DONE] = 1
+        await serving
+
+    with open_channel("127.0.0.1", 0) as listener:
+        asyncio.run(greet_and_reset(listener))
 
 
 def said(address, *lines):
