@@ -40,7 +40,7 @@ class Operator:
     Args:
         address: of the channel.
         token: of the run; needed where it asks for one.
-        role: `operator` gives orders, `observer` watches.
+        role: `operator` gives orders, `observer` watches, and may end the run.
         name: that others are told.
         patience: how long an answer may take [s].
 

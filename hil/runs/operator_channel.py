@@ -4,8 +4,8 @@
                               checks an operator's requests, plans, and writes the plans into shared memory
                     loop      takes them as they come, as those of a streamed target
 
-Any number of observers may watch; one operator at a time gives orders. A run whose target is known beforehand cannot be moved,
-but its operator may end it.
+Observers may watch, and end the run; one operator at a time gives all other orders. A run whose target is known beforehand
+cannot be moved.
 """
 
 import asyncio
@@ -64,8 +64,8 @@ _MOST_WAITING = 1 << 18
 
 _RESTING = {"time": 0.0, "moving": False, "jogging": False, "paused": False, "mode": "preparing"}
 
-_WATCHING = ("state", "margins", "watch")
-"""What an observer may ask for."""
+_FOR_ALL = ("state", "margins", "watch", "end", "emergency")
+"""What an observer may ask for: who sees that something goes wrong may end the run."""
 
 _ROLES = OPERATOR, OBSERVER = "operator", "observer"
 
@@ -244,8 +244,8 @@ class _Channel:
                 raise InputError(
                     f"there is nothing to do called {printable(str(do))[:40]!r}; there are {', '.join(self._doing)}"
                 )
-            if client.role != OPERATOR and do not in _WATCHING:
-                raise RefusedError("an observer gives no orders: connect as the operator")
+            if client.role != OPERATOR and do not in _FOR_ALL:
+                raise RefusedError("an observer gives no orders but to end the run: connect as the operator")
             return {"id": about, "ok": True, **self._doing[do](client, request)}
         except RefusedError as refusal:
             near = None if refusal.nearest is None else pose_message(refusal.nearest)

@@ -465,13 +465,21 @@ def test_one_operator_at_a_time_and_observers_who_give_no_orders(hexapod):
             observer.listen(0.5)
             assert observer.telemetry["mode"] == "preparing" and observer.telemetry["commanded"]["position"][2] == 0.35
             listen_to_the_newest(observer)
-            for order in ("move", "jog", "stop", "end", "emergency", "beat"):
-                with pytest.raises(RequestRefusedError, match="an observer gives no orders"):
+            for order in ("move", "follow", "step", "jog", "stop", "pause", "resume", "beat"):
+                with pytest.raises(RequestRefusedError, match="an observer gives no orders but to end the run"):
                     observer.ask(order)
             assert run.link[Link.STOP] == 0
+            # Whoever else operates.
+            observer.end()
+            assert run.link[Link.STOP] == StopRequest.CONTROLLED
+            observer.emergency()
+            assert run.link[Link.STOP] == StopRequest.QUICK
+        run.link[Link.STOP] = 0
         operator.end()
         assert run.link[Link.STOP] == StopRequest.CONTROLLED
         operator.emergency()
+        assert run.link[Link.STOP] == StopRequest.QUICK
+        operator.end()
         assert run.link[Link.STOP] == StopRequest.QUICK
         operator.close()
         time.sleep(0.2)
