@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from controller.frames import Move
 from controller.planning.motions.document import place_of
 from controller.planning.motions.elements import Place, ToolLimits
+from controller.planning.motions.waves import checked_number
 from controller.planning.points import HOME
 from controller.safety.causes import Cause
 from hil.loop.records import Link, StopRequest
@@ -44,6 +45,7 @@ from hil.runs.telemetry import (
 from plant.checks import printable
 from plant.compiled import Record
 from plant.errors import GoughError, InputError, PlanningError
+from plant.pose import checked_array
 
 TELEMETRY_HZ = 30.0
 
@@ -61,6 +63,9 @@ _HELLO_S = 5.0
 
 _MOST_WAITING = 1 << 18
 """Bytes that wait for a client that reads too slowly; it gets no telemetry meanwhile."""
+
+_MOST_WORDS = 1000
+"""Characters of an error, which may repeat what a client has sent."""
 
 _RESTING = {"time": 0.0, "moving": False, "jogging": False, "paused": False, "mode": "preparing"}
 
@@ -240,7 +245,7 @@ class _Channel:
                 about = None
                 raise InputError("id must be a number or a text")
             do = request.get("do")
-            if do not in self._doing:
+            if not isinstance(do, str) or do not in self._doing:
                 raise InputError(
                     f"there is nothing to do called {printable(str(do))[:40]!r}; there are {', '.join(self._doing)}"
                 )
@@ -249,9 +254,9 @@ class _Channel:
             return {"id": about, "ok": True, **self._doing[do](client, request)}
         except RefusedError as refusal:
             near = None if refusal.nearest is None else pose_message(refusal.nearest)
-            return {"id": about, "ok": False, "kind": "refused", "error": str(refusal), "nearest": near}
+            return {"id": about, "ok": False, "kind": "refused", "error": str(refusal)[:_MOST_WORDS], "nearest": near}
         except GoughError as error:
-            return {"id": about, "ok": False, "kind": "malformed", "error": str(error)}
+            return {"id": about, "ok": False, "kind": "malformed", "error": str(error)[:_MOST_WORDS]}
 
     @property
     def _moved(self) -> OperatedPlatform:
@@ -276,9 +281,7 @@ class _Channel:
     def _jog(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client
         rate = _move_in(request, "velocity", "turn_velocity")
-        deadman = request.get("deadman", DEADMAN_S)
-        if isinstance(deadman, bool) or not isinstance(deadman, int | float):
-            raise InputError("deadman must be a number")
+        deadman = checked_number(request.get("deadman", DEADMAN_S), "deadman")
         return {"duration": self._moved.jog(rate.translation, rate.rotation_vector, rate.axes, deadman)}
 
     def _beat(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
@@ -331,9 +334,7 @@ class _Channel:
         return {"margins": self._told_margins}
 
     def _watch(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
-        rate = request.get("rate", TELEMETRY_HZ)
-        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 <= rate <= TELEMETRY_HZ:
-            raise InputError(f"rate is {printable(str(rate))[:20]}; it must be 0 to {TELEMETRY_HZ:g} Hz")
+        rate = checked_number(request.get("rate", TELEMETRY_HZ), "rate", 0.0, TELEMETRY_HZ)
         client.period = np.inf if rate == 0.0 else 1.0 / rate
         return {"rate": rate}
 
@@ -425,12 +426,9 @@ def _goal_in(request: dict[str, Any]) -> tuple[Place | str, str | None, str | No
 def _limits_in(request: dict[str, Any]) -> ToolLimits:
     """The limits of a move; speeds that are not given are the usual ones."""
     given = {name: request[name] for name in ToolLimits.__dataclass_fields__ if request.get(name) is not None}
-    for name, value in given.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(f"{name} must be a number")
     return ToolLimits(**{"speed": SPEED, "turn_speed": TURN_SPEED, **given})
 
 
 def _move_in(request: dict[str, Any], *names: str) -> Move:
-    straight, turn = (request.get(name, (0.0, 0.0, 0.0)) for name in names)
+    straight, turn = (checked_array(request.get(name, (0.0, 0.0, 0.0)), (3,), name) for name in names)
     return Move(straight, turn, _name_in(request, "axes"))

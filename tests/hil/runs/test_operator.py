@@ -40,6 +40,7 @@ PATIENCE_NS = 10_000_000_000
 """A busy machine is not what is tested here."""
 CYCLES = 30_000
 TOKEN = "0123456789abcdef0123"
+HUGE = 10**400
 
 POINTS = """
 [points.left]
@@ -204,7 +205,7 @@ def test_what_cannot_be_reached_is_refused_with_the_nearest_pose_which_can(hexap
             ({"to": {"positon": [0, 0, 0]}}, "mean 'position'"),
             ({"to": "home", "frame": "table"}, "no frame 'table'"),
             ({"to": "home", "speed": -1}, "speed is -1"),
-            ({"to": "home", "speed": "fast"}, "speed must be a number"),
+            ({"to": "home", "speed": "fast"}, "speed is 'fast'; it must be a finite number"),
         ):
             with pytest.raises(RequestRefusedError, match=said) as refused:
                 operator.ask("move", **bad)
@@ -555,6 +556,34 @@ def said(address, *lines):
         except (TimeoutError, ConnectionResetError, BrokenPipeError):
             pass
     return [json.loads(line) for line in answer.splitlines()]
+
+
+MALFORMED = [
+    {"do": []}, {"do": {}}, {"do": None}, {"do": "state", "id": 1.5}, {"do": "watch", "rate": HUGE}, {"do": "watch", "rate": []},
+    {"do": "jog", "velocity": [0.01, 0.0, 0.0], "deadman": HUGE}, {"do": "jog", "velocity": [0.01, 0.0, 0.0], "deadman": True},
+    {"do": "jog", "velocity": [0.01, 0.0]}, {"do": "jog", "turn_velocity": "fast"}, {"do": "jog", "velocity": [HUGE, 0, 0]},
+    {"do": "step", "translation": [0.001, 0.002]}, {"do": "step", "rotation": None}, {"do": "step", "translation": {"x": 1}},
+    {"do": "step", "translation": [[0.001], [0.0, 1.0], 0.0]}, {"do": "step", "translation": [1e200, 0.0, 0.0]},
+    {"do": "move", "to": "home", "speed": HUGE}, {"do": "move", "to": [0.0, 0.0, 0.0]}, {"do": "move", "to": {"position": [HUGE, 0, 0]}},
+    {"do": "move", "to": {"position": [0, 0, 0], "relative": []}}, {"do": "move", "to": 3, "frame": []}, {"do": "follow"},
+    {"do": "follow", "to": {"rotation": [1e308, 1e308, 1e308]}}, {"do": "step", "translation": [0.0] * 15_000},
+]  # fmt: skip
+"""What no client should send, and one of another maker might."""
+
+
+@pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
+def test_whatever_is_asked_for_is_answered_and_the_client_keeps_its_connection(name):
+    with running(load_in_space(name)) as run, run.operator() as operator:
+        begun(operator)
+        for request in MALFORMED:
+            operator._send({"id": 7, **request} if isinstance(request["do"], str) else request)
+            answer = operator._line(time.monotonic() + 5.0)
+            assert answer["ok"] is False and answer["kind"] in ("malformed", "refused"), (request, answer)
+            assert len(answer["error"]) <= 1000
+        # Much too far, which costs no more than any other way that is refused.
+        with pytest.raises(RequestRefusedError, match="stroke of leg"):
+            operator.step((1e6 if name == "hexapod" else 0.0, 1e6, 0.0))
+        assert operator.ask("state")["telemetry"]["moving"] is False and run.cause[0] == Cause.NONE
 
 
 def test_a_token_is_asked_for_and_nobody_else_gets_in(hexapod):
