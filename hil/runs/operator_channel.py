@@ -128,7 +128,7 @@ class _Channel:
         self._timed = 0
         self._last_timing: Mapping[str, float] = {}
         self._clients: list[_Client] = []
-        self._waiting = 0
+        self._silent: list[asyncio.StreamWriter] = []
         self._measured, self._told_margins = -np.inf, list[dict[str, Any]]()
         self._doing: dict[str, Callable[[_Client, dict[str, Any]], dict[str, Any]]] = {
             "move": self._move, "follow": self._follow, "step": self._step_by, "jog": self._jog, "beat": self._beat,
@@ -179,19 +179,14 @@ class _Channel:
 
     async def _greeted(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> _Client | None:
         """A client that may stay, which has its place from here on; another one is told why not."""
-        if self._waiting + len(self._clients) >= MOST_CLIENTS:
+        line = await self._first_line(reader, writer)
+        if not line:
             return None
-        self._waiting += 1
-        kind, error, hello = "malformed", "", dict[str, Any]()
         try:
-            hello = decode(await asyncio.wait_for(_line(reader), _HELLO_S))
+            hello = decode(line)
             kind, error = self._refusal(hello)
         except GoughError as refusal:
-            error = str(refusal)
-        except TimeoutError:
-            return None
-        finally:
-            self._waiting -= 1
+            hello, kind, error = {}, "malformed", str(refusal)
         if error:
             writer.write(encode({"gough": VERSION, "ok": False, "kind": kind, "error": error}))
             return None
@@ -202,6 +197,20 @@ class _Channel:
         self._clients.append(client)
         return client
 
+    async def _first_line(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bytes:
+        """What a client says first; b"" if it says nothing in time."""
+        if len(self._silent) >= MOST_CLIENTS:
+            # The one that has said nothing for the longest makes room: nobody is kept out by those who say nothing.
+            self._silent.pop(0).transport.abort()
+        self._silent.append(writer)
+        try:
+            return await asyncio.wait_for(_line(reader), _HELLO_S)
+        except TimeoutError:
+            return b""
+        finally:
+            if writer in self._silent:
+                self._silent.remove(writer)
+
     def _refusal(self, hello: dict[str, Any]) -> tuple[str, str]:
         """Why a client may not stay: kind and words, "" if it may."""
         if hello.get("gough") != VERSION:
@@ -211,12 +220,12 @@ class _Channel:
             return "token", "the token is wrong: give that of the run, with --token-file FILE or in GOUGH_TOKEN"
         if hello.get("role") not in _ROLES:
             return "malformed", f"the role is {printable(str(hello.get('role')))[:20]!r}; it is {' or '.join(_ROLES)}"
-        operator = next((each for each in self._clients if each.role == OPERATOR), None)
-        if hello["role"] == OPERATOR and operator is not None:
-            return (
-                "busy",
-                f"{operator.name} operates this run, and only one may: wait until that has gone, or watch as an observer",
-            )
+        others = [each for each in self._clients if each.role == hello["role"]]
+        if hello["role"] == OPERATOR and others:
+            who = others[0].name
+            return "busy", f"{who} operates this run, and only one may: wait until that has gone, or watch as an observer"
+        if len(others) >= MOST_CLIENTS:
+            return "busy", f"{len(others)} observers watch this run, and no more may: close one of them"
         return "", ""
 
     def _described(self) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import signal
 import socket
 import struct
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ from controller.planning.segments import evaluate_reference
 from controller.safety.causes import Cause
 from controller.workspace import Demands, margins
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
-from hil.runs.channel_process import open_channel
+from hil.runs.channel_process import MOST_CLIENTS, open_channel
 from hil.runs.operated_platform import DEADMAN_S, OperatedPlatform, Workplace
 from hil.runs.operator import Operator, RequestRefusedError
 from hil.runs.operator_channel import _Channel, serve_channel
@@ -556,6 +556,31 @@ def said(address, *lines):
         except (TimeoutError, ConnectionResetError, BrokenPipeError):
             pass
     return [json.loads(line) for line in answer.splitlines()]
+
+
+def test_neither_who_says_nothing_nor_all_the_observers_keep_the_operator_out(hexapod):
+    with running(hexapod, token=TOKEN) as run, ExitStack() as others:
+        address = channel_address(run.address, None)
+        silent = [others.enter_context(socket.create_connection(address)) for _ in range(3 * MOST_CLIENTS)]
+        watching = [others.enter_context(run.operator(role="observer")) for _ in range(MOST_CLIENTS)]
+        with pytest.raises(ChannelError, match=f"{MOST_CLIENTS} observers watch this run, and no more may") as refused:
+            run.operator(role="observer")
+        assert refused.value.kind == "busy"
+        silent += [others.enter_context(socket.create_connection(address)) for _ in range(MOST_CLIENTS)]
+        with run.operator() as operator:
+            begun(operator)
+        # The first ones have made room.
+        silent[0].settimeout(5.0)
+        with suppress(ConnectionResetError):
+            assert silent[0].recv(1) == b""
+        watching[0].close()
+        until = time.monotonic() + 5.0
+        while True:
+            with suppress(ChannelError):
+                run.operator(role="observer").close()
+                break
+            assert time.monotonic() < until
+            time.sleep(0.02)
 
 
 MALFORMED = [
