@@ -52,7 +52,7 @@ _OUT_OF_PLANE = 1e-9
 """A planar mechanism may be asked to leave its plane by so much, which is rounding [m or rad]."""
 
 _STEP_M, _STEP_RAD, _MOST_POSES = 1e-3, np.radians(0.2), 10_000
-"""Poses of a way are checked so far apart, unless it is so long that these do not reach: it then leads far beyond all limits."""
+"""Poses of a way are checked so far apart. One that is too long for so many of them leads far beyond all limits."""
 
 _OFFER_S = 0.01
 _PATIENCE_S = 1.0
