@@ -347,10 +347,11 @@ class _Orders:
             self._jogging = self._operator_of(client).ask("beat")["jogging"]
 
     def _release(self, client: Any) -> None:
+        operator = self._operator_of(client)
         self._held_at = 0.0
         if self._jogging:
             self._jogging = False
-            self._operator_of(client).stop()
+            operator.stop()
 
     def _follow(self, client: Any) -> None:
         operator, place = self._operator_of(client), self._place
