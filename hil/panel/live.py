@@ -106,10 +106,8 @@ class LivePanel:
             self._button("Pause", self._ordered(lambda operator: operator.pause()))
             self._button("Go on", self._ordered(lambda operator: operator.resume(wait=False)))
         with gui.add_folder("End the run"):
-            self._button("Controlled stop", self._ended(lambda operator: operator.end()), color="orange")
-            self._button(
-                "Software quick stop (no emergency stop)", self._ended(lambda operator: operator.emergency()), color="red"
-            )
+            self._end_button("Controlled stop", lambda operator: operator.end(), "orange")
+            self._end_button("Software quick stop (no emergency stop)", lambda operator: operator.emergency(), "red")
         tabs = gui.add_tab_group()
         if self._run["operated"]:
             for label, build in (("Jog", self._build_jog), ("Go to", self._build_moves), ("Sliders", self._build_sliders)):
@@ -196,11 +194,12 @@ class LivePanel:
         button.on_click(clicked)
         return button
 
+    def _end_button(self, label: str, do: Callable[[Operator], Any], color: Any) -> None:
+        # A plain function waits in a thread of the library, beside all other orders.
+        self._server.gui.add_button(label, color=color).on_click(lambda event: self._orders.end(event.client, do))
+
     def _ordered(self, do: Callable[[Operator], Any]) -> Callable[[Any], None]:
         return lambda client: self._orders.give(client, do)
-
-    def _ended(self, do: Callable[[Operator], Any]) -> Callable[[Any], None]:
-        return lambda client: self._orders.end(client, do)
 
     # ---------------------------------------------------------------------------------------------------------- telemetry
 
@@ -257,8 +256,12 @@ class _Orders:
         self._queue.put((client, lambda client: do(self._operator_of(client))))
 
     def end(self, client: Any, do: Callable[[Operator], Any]) -> None:
-        """End the run, whoever has control."""
-        self._queue.put((client, lambda _: self._end(do)))
+        """End the run at once, whoever operates it; returns when it has answered."""
+        try:
+            with Operator(*self._channel, role="observer", name="gough panel") as observer:
+                do(observer)
+        except ChannelError as error:
+            self._refuse(client, str(error))
 
     def hold(self, client: Any, jog: dict[str, Any]) -> None:
         """A sign of life of a button that is held; the first one begins the jog."""
@@ -320,13 +323,6 @@ class _Orders:
         self._shown(self._who)
         if client.client_id not in self._server.get_clients():
             self._drop()
-
-    def _end(self, do: Callable[[Operator], Any]) -> None:
-        if self._operator is not None:
-            do(self._operator)
-            return
-        with Operator(*self._channel, name="gough panel") as operator:
-            do(operator)
 
     def _hold(self, client: Any, jog: dict[str, Any]) -> None:
         operator, now = self._operator_of(client), time.monotonic()
