@@ -18,8 +18,9 @@ from typing import Any
 
 import viser
 
+from hil.panel.gui import set_text, set_theme, tell_not_done
 from hil.panel.margins import MARGINS_S, MarginTable
-from hil.panel.readings import Readings, event_list, set_text, set_theme
+from hil.panel.readings import Readings, event_list
 from hil.panel.scene import Machine, Scene
 from hil.runs.operator import BEAT_S, Operator, RequestRefusedError
 from hil.runs.operator_messages import RUN_ENDED, ChannelError
@@ -261,7 +262,7 @@ class _Orders:
             with Operator(*self._channel, role="observer", name="gough panel") as observer:
                 do(observer)
         except ChannelError as error:
-            self._refuse(client, str(error))
+            tell_not_done(self._server, client, str(error))
 
     def hold(self, client: Any, jog: dict[str, Any]) -> None:
         """A sign of life of a button that is held; the first one begins the jog."""
@@ -300,9 +301,9 @@ class _Orders:
         try:
             do(client)
         except RequestRefusedError as error:
-            self._refuse(client, str(error))
+            tell_not_done(self._server, client, str(error))
         except (ChannelError, _NoControlError) as error:
-            self._refuse(client, str(error))
+            tell_not_done(self._server, client, str(error))
             if isinstance(error, ChannelError):
                 self.leave(client)
 
@@ -362,7 +363,3 @@ class _Orders:
         if operator is not None:
             operator.close()
             self._shown(None)
-
-    def _refuse(self, client: Any, text: str) -> None:
-        if client.client_id in self._server.get_clients():
-            client.add_notification("Not done", text, color="red", auto_close_seconds=8.0)

@@ -14,6 +14,7 @@ from controller.planning import OPERATOR_TARGET
 from controller.planning.motions import load_motion
 from controller.planning.motions.built_in import NAMES
 from controller.planning.target import MOTION_SUFFIX
+from hil.panel.gui import set_text, tell_not_done
 from plant.errors import GoughError, InputError
 from plant.imu import PRESETS
 from plant.mechanism import load_in_space, preset_names
@@ -77,7 +78,7 @@ class RunForm:
     """
 
     def __init__(self, server: viser.ViserServer, start: Callable[[list[str]], None]) -> None:
-        self._server, self._start = server, start
+        self._start = start
         gui = server.gui
         self._note = gui.add_markdown("")
         mechanisms, targets = _files(load_in_space), [*_files(load_motion), *map(str, sorted(Path().glob("*.csv")))]
@@ -99,14 +100,13 @@ class RunForm:
             try:
                 self._start(self.options())
             except GoughError as error:
-                event.client.add_notification("Not started", str(error), color="red", auto_close_seconds=8.0)
+                tell_not_done(server, event.client, str(error))
 
         button.on_click(clicked)
 
     def say(self, text: str) -> None:
         """Tell what has become of the last run."""
-        if self._note.content != text:
-            self._note.content = text
+        set_text(self._note, text)
 
     def options(self) -> list[str]:
         """The options of the run that is asked for.
