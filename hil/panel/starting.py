@@ -15,6 +15,7 @@ from controller.planning.motions import load_motion
 from controller.planning.motions.built_in import NAMES
 from controller.planning.target import MOTION_SUFFIX
 from hil.panel.gui import set_text, tell_not_done
+from plant.checks import check_duration, check_rate
 from plant.errors import GoughError, InputError
 from plant.imu import PRESETS
 from plant.mechanism import load_in_space, preset_names
@@ -112,14 +113,17 @@ class RunForm:
         """The options of the run that is asked for.
 
         Raises:
-            InputError: a browser has sent what it was not offered.
+            InputError: a browser has sent what it was not offered, or a duration or a rate that no run can have.
         """
         options = []
         for flag, (choice, names) in self.choices.items():
             if choice.value not in names:
                 raise InputError(f"there is no {flag[2:]} {choice.value!r} to choose: reload the page")
             options += [flag, choice.value]
-        return [*options, "--duration", f"{self._duration.value:g}", "--rate", f"{self._rate.value:g}", *_PATIENT]
+        duration, rate = float(self._duration.value), float(self._rate.value)
+        check_duration(duration)
+        check_rate(rate)
+        return [*options, "--duration", f"{duration:g}", "--rate", f"{rate:g}", *_PATIENT]
 
 
 def _first(name: str, names: Any) -> tuple[str, ...]:

@@ -583,7 +583,7 @@ def test_neither_who_says_nothing_nor_all_the_observers_keep_the_operator_out(he
 
 
 MALFORMED = [
-    {"do": []}, {"do": {}}, {"do": None}, {"do": "state", "id": 1.5}, {"do": "watch", "rate": HUGE}, {"do": "watch", "rate": ""},
+    {"do": []}, {"do": {}}, {"do": None}, {"do": "state", "id": 1.5}, {"do": "watch", "rate": HUGE}, {"do": "jog"},
     {"do": "jog", "velocity": [0.01, 0.0, 0.0], "deadman": HUGE}, {"do": "jog", "velocity": [0.01, 0.0, 0.0], "deadman": True},
     {"do": "jog", "velocity": [0.01, 0.0]}, {"do": "jog", "turn_velocity": "fast"}, {"do": "jog", "velocity": [HUGE, 0, 0]},
     {"do": "step", "translation": [0.001, 0.002]}, {"do": "step", "rotation": None}, {"do": "step", "translation": {"x": 1}},
