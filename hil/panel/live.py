@@ -69,7 +69,10 @@ class LivePanel:
         self._events: deque[str] = deque(maxlen=_EVENTS)
         self._measured = 0.0
         self._build()
-        server.on_client_disconnect(self._orders.leave)
+
+    def leave(self, client: viser.ClientHandle) -> None:
+        """The browser has gone."""
+        self._orders.leave(client)
 
     def run(self, over: threading.Event) -> str:
         """Show the run until it ends or `over` is set; the picture of its last state stays. Returns how it ended, in words."""

@@ -38,6 +38,8 @@ class Page:
         self._note = f"**No run** answers at {address}."
         self._wanted: list[str] | None = None
         self._started: StartedRun | None = None
+        self._live: LivePanel | None = None
+        server.on_client_disconnect(self._leave)
 
     def run(self, over: threading.Event, options: Sequence[str] | None = None) -> None:
         """Show runs, one after the other, until `over` is set; a run that the page has started ends with it.
@@ -61,8 +63,7 @@ class Page:
                     if self._started is not None and self._started.status is not None:
                         # This is another one.
                         self._started = None
-                    self._note = live.run(over)
-                    live.close()
+                    self._show(live, over)
                     continue
                 self._watch_started(must_begin)
                 over.wait(_LOOK_S)
@@ -87,6 +88,19 @@ class Page:
             if error.kind in _REFUSALS:
                 raise
             return None
+
+    def _show(self, live: LivePanel, over: threading.Event) -> None:
+        """Show a run until it ends."""
+        self._live = live
+        try:
+            self._note = live.run(over)
+        finally:
+            self._live = None
+            live.close()
+
+    async def _leave(self, client: viser.ClientHandle) -> None:
+        if (live := self._live) is not None:
+            live.leave(client)
 
     def _watch_started(self, must_begin: bool) -> None:
         """Start the run that is wanted, and tell what has become of it as long as it does not answer."""
