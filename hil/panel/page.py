@@ -40,6 +40,7 @@ class Page:
         self._wanted: list[str] | None = None
         self._started: StartedRun | None = None
         self._live: LivePanel | None = None
+        server.on_client_connect(self._welcome)
         server.on_client_disconnect(self._leave)
 
     def run(self, over: threading.Event, options: Sequence[str] | None = None) -> None:
@@ -103,10 +104,16 @@ class Page:
         """Show a run until it ends."""
         self._live = live
         try:
+            for client in self._server.get_clients().values():
+                live.welcome(client)
             self._note = live.run(over)
         finally:
             self._live = None
             live.close()
+
+    async def _welcome(self, client: viser.ClientHandle) -> None:
+        if (live := self._live) is not None:
+            live.welcome(client)
 
     async def _leave(self, client: viser.ClientHandle) -> None:
         if (live := self._live) is not None:
