@@ -125,7 +125,7 @@ class Orders:
             if self._jogging:
                 self._do(client, self._beat)
             elif self._unsettled and self._queue.empty():
-                self._do(client, self._look_whether_it_rests)
+                self._look_whether_it_rests(client.client_id)
 
     def _do(self, client: Any, do: Callable[[Any], Any]) -> None:
         try:
@@ -185,11 +185,15 @@ class Orders:
         if self._newest.get(client.client_id) is place:
             operator.follow(place)
 
-    def _look_whether_it_rests(self, client: Any) -> None:
-        given, state = self._given, self._operator_of(client).ask("state")["telemetry"]
-        if not state["moving"]:
-            self._unsettled = False
-            self._server.get_event_loop().call_soon_threadsafe(self._tell_rest, given, client.client_id, state["commanded"])
+    def _look_whether_it_rests(self, who: int) -> None:
+        given, operator, self._unsettled = self._given, self._operator, False
+        # That the run has ended is seen by the page itself.
+        with suppress(ChannelError):
+            if operator is not None:
+                state = operator.ask("state")["telemetry"]
+                self._unsettled = state["moving"]
+                if not state["moving"]:
+                    self._server.get_event_loop().call_soon_threadsafe(self._tell_rest, given, who, state["commanded"])
 
     def _tell_rest(self, given: int, who: int, pose: Mapping[str, Any]) -> None:
         # An order that was given since then may move it.
