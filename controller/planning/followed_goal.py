@@ -43,7 +43,7 @@ class FollowedGoal:
     def __init__(self, mechanism: Mechanism, start: Pose, goal: Pose, speed: float, turn_speed: float) -> None:
         self._mechanism, self._home, self._free = mechanism, mechanism.require_home(), moving_axes(mechanism)
         count = len(self._free)
-        self._otg, self._trajectory, self._began = Ruckig(count), Trajectory(count), 0.0
+        self._otg = Ruckig(count)
         self._parameters = InputParameter(count)
         actuators, joints = mechanism.require_limits(), mechanism.platform_joints
         # Of a turn, the joint that is farthest out moves fastest.
@@ -54,9 +54,8 @@ class FollowedGoal:
         self._parameters.max_velocity = np.minimum(asked, share * actuators.velocity).tolist()
         self._parameters.max_acceleration = (share * actuators.acceleration).tolist()
         self._parameters.max_jerk = (share * actuators.jerk).tolist()
-        self.stopped = False
         at_rest = [0.0] * count
-        self._plan_to(goal, (self._coordinates(start).tolist(), at_rest, at_rest))
+        self._plan((self._coordinates(start).tolist(), at_rest, at_rest), 0.0, self._coordinates(goal).tolist())
 
     @property
     def duration(self) -> float:
@@ -70,18 +69,16 @@ class FollowedGoal:
             InputError, PlanningError: as for a new way; this one goes on.
         """
         if not self.stopped:
-            state, self._began = self._state(time), max(time, self._began)
-            self._plan_to(goal, state)
+            self._plan(self._state(time), max(time, self._began), self._coordinates(goal).tolist())
 
     def stop(self, time: float) -> None:
-        """Come to rest on the way, from a time after the begin [s]."""
-        if self.stopped or time >= self.duration:
-            return
-        state = self._state(time)
-        self._parameters.control_interface = ControlInterface.Velocity
-        self._parameters.target_velocity = [0.0] * len(self._free)
-        self._began, self.stopped = max(time, self._began), True
-        self._plan(state)
+        """Come to rest on the way, from a time after the begin [s].
+
+        Raises:
+            PlanningError: ruckig found no way to rest; this one goes on.
+        """
+        if not self.stopped and time < self.duration:
+            self._plan(self._state(time), max(time, self._began), None)
 
     def pose(self, time: float) -> Pose:
         """The pose of the platform at a time after the begin [s]."""
@@ -104,20 +101,15 @@ class FollowedGoal:
         pose = self.pose(time)
         return leg_lengths(self._mechanism, pose.position, pose.rotation)
 
-    def _plan_to(self, goal: Pose, state: tuple[list[float], list[float], list[float]]) -> None:
-        before = self._parameters.target_position
-        self._parameters.target_position = self._coordinates(goal).tolist()
-        try:
-            self._plan(state)
-        except PlanningError:
-            self._parameters.target_position = before
-            raise
-
-    def _plan(self, state: tuple[list[float], list[float], list[float]]) -> None:
-        trajectory = Trajectory(len(self._free))
+    def _plan(self, state: tuple[list[float], list[float], list[float]], began: float, target: list[float] | None) -> None:
+        """Plan from a state at a time [s] to a target, None for rest on the way; where that fails, nothing changes."""
+        stops, trajectory = target is None, Trajectory(len(self._free))
+        self._parameters.control_interface = ControlInterface.Velocity if stops else ControlInterface.Position
+        if target is not None:
+            self._parameters.target_position = target
         if not calculate(self._otg, self._parameters, state, trajectory):
-            raise PlanningError(f"ruckig finds no way to {self._parameters.target_position}: choose another goal")
-        self._trajectory = trajectory
+            raise PlanningError(f"ruckig finds no way to {'rest' if stops else target}: choose another goal")
+        self._trajectory, self._began, self.stopped = trajectory, began, stops
         self.lengths = self._lengths(self.duration)
 
     def _coordinates(self, pose: Pose) -> Array:

@@ -65,13 +65,12 @@ class StraightWay:
         poses = self.poses(knots)
         self._legs = natural_spline(knots, leg_lengths(mechanism, poses.position, poses.rotation))
         self.lengths = self._legs[:, -1, 1].copy()
-        self.stopped = False
-        self._otg, self._trajectory, self._began = Ruckig(1), Trajectory(1), 0.0
+        self._otg = Ruckig(1)
         self._parameters = InputParameter(1)
         most = self._limits_of_parameter(mechanism, limits or ToolLimits())
         self._parameters.max_velocity, self._parameters.max_acceleration, self._parameters.max_jerk = ([each] for each in most)
         self._parameters.target_position = [1.0]
-        self._plan((0.0, 0.0, 0.0))
+        self._plan((0.0, 0.0, 0.0), 0.0)
 
     @property
     def duration(self) -> float:
@@ -100,19 +99,23 @@ class StraightWay:
         return values[0], values[1] * rate
 
     def stop(self, time: float) -> None:
-        """Come to rest on the way, from a time after the begin [s]."""
+        """Come to rest on the way, from a time after the begin [s].
+
+        Raises:
+            PlanningError: ruckig found no way to rest; this one goes on.
+        """
         if self.stopped or time >= self.duration:
             return
-        state = self.parameter(time)
-        self._parameters.control_interface = ControlInterface.Velocity
-        self._parameters.target_velocity = [0.0]
-        self._began, self.stopped = time, True
-        self._plan(state)
+        self._plan(self.parameter(time), time, stops=True)
         self.lengths = self.at(self.duration)[0]
 
-    def _plan(self, state: tuple[float, float, float]) -> None:
-        if not calculate(self._otg, self._parameters, [[each] for each in state], self._trajectory):
+    def _plan(self, state: tuple[float, float, float], began: float, stops: bool = False) -> None:
+        """Plan from a state at a time [s], to the end or to rest on the way; where that fails, nothing changes."""
+        self._parameters.control_interface = ControlInterface.Velocity if stops else ControlInterface.Position
+        trajectory = Trajectory(1)
+        if not calculate(self._otg, self._parameters, [[each] for each in state], trajectory):
             raise PlanningError(f"ruckig finds no way along {self.far:g} m and {self.turned:g} rad: choose another speed")
+        self._trajectory, self._began, self.stopped = trajectory, began, stops
 
     def _end(self) -> float:
         return float(self._trajectory.at_time(self._trajectory.duration)[0][0])

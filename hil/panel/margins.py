@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import viser
 
+from hil.panel.gui import set_text
+
 MARGINS_S = 0.3
 """Time between two looks at the margins."""
 
@@ -22,9 +24,7 @@ class MarginTable:
 
     def show(self, margins: Sequence[Mapping[str, Any]]) -> None:
         """Show margins, as `margins_message` has them."""
-        text = margin_table(margins)
-        if self._text.content != text:
-            self._text.content = text
+        set_text(self._text, margin_table(margins))
 
 
 def margin_table(margins: Sequence[Mapping[str, Any]]) -> str:

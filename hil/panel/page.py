@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import viser
 
+from hil.panel.gui import tell_not_done
 from hil.panel.live import LivePanel
 from hil.panel.starting import RunForm, StartedRun
 from hil.runs.operator_messages import ChannelError
@@ -38,6 +39,9 @@ class Page:
         self._note = f"**No run** answers at {address}."
         self._wanted: list[str] | None = None
         self._started: StartedRun | None = None
+        self._live: LivePanel | None = None
+        server.on_client_connect(self._welcome)
+        server.on_client_disconnect(self._leave)
 
     def run(self, over: threading.Event, options: Sequence[str] | None = None) -> None:
         """Show runs, one after the other, until `over` is set; a run that the page has started ends with it.
@@ -47,7 +51,7 @@ class Page:
 
         Raises:
             ChannelError: a run refuses the panel.
-            InputError: a run is there already, and another one should be started.
+            InputError: a run is there already, and another one should be started at once.
             NotBegunError: the run that was started at once has ended before it began.
         """
         self._wanted, must_begin = None if options is None else list(options), options is not None
@@ -55,14 +59,12 @@ class Page:
             while not over.is_set():
                 if (live := self._attached()) is not None:
                     if self._wanted is not None:
-                        live.close()
-                        raise InputError(f"a run answers at {self._address} already: leave --start out, or name another --at")
+                        self._give_up_wish(live, must_begin)
                     self._form, must_begin = None, False
                     if self._started is not None and self._started.status is not None:
                         # This is another one.
                         self._started = None
-                    self._note = live.run(over)
-                    live.close()
+                    self._show(live, over)
                     continue
                 self._watch_started(must_begin)
                 over.wait(_LOOK_S)
@@ -87,6 +89,35 @@ class Page:
             if error.kind in _REFUSALS:
                 raise
             return None
+
+    def _give_up_wish(self, live: LivePanel, must_begin: bool) -> None:
+        """Another run has come before the one that is wanted."""
+        answers = f"a run answers at {self._address} already"
+        if must_begin:
+            live.close()
+            raise InputError(f"{answers}: leave --start out, or name another --at")
+        self._wanted = None
+        for client in self._server.get_clients().values():
+            tell_not_done(self._server, client, f"{answers}: no other one was started")
+
+    def _show(self, live: LivePanel, over: threading.Event) -> None:
+        """Show a run until it ends."""
+        self._live = live
+        try:
+            for client in self._server.get_clients().values():
+                live.welcome(client)
+            self._note = live.run(over)
+        finally:
+            self._live = None
+            live.close()
+
+    async def _welcome(self, client: viser.ClientHandle) -> None:
+        if (live := self._live) is not None:
+            live.welcome(client)
+
+    async def _leave(self, client: viser.ClientHandle) -> None:
+        if (live := self._live) is not None:
+            live.leave(client)
 
     def _watch_started(self, must_begin: bool) -> None:
         """Start the run that is wanted, and tell what has become of it as long as it does not answer."""

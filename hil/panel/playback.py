@@ -6,8 +6,9 @@ from typing import Any
 
 import viser
 
+from hil.panel.gui import set_theme
 from hil.panel.margins import MARGINS_S, MarginTable
-from hil.panel.readings import Readings, set_theme
+from hil.panel.readings import Readings
 from hil.panel.scene import Machine, Scene
 from hil.runs.recorded_run import RecordedRun
 from hil.runs.telemetry import frames_message, machine_message

@@ -8,7 +8,8 @@ import numpy as np
 import viser
 
 from controller.frames import BASE, PLATFORM, ActiveFrames, parse_frames
-from hil.look import COLORINGS, ESTIMATE, LENGTH, LIGHT, REFERENCE, ROOM, SPEED, TRUTH, rgb
+from hil.look import COLORINGS, ESTIMATE, LENGTH, REFERENCE, ROOM, SPEED, TRUTH
+from hil.panel.gui import set_text
 from hil.panel.scene import Machine, Scene
 from hil.runs.operator_messages import pose_in, pose_message
 from plant.imu_wiring import PLATFORM_IMU
@@ -51,20 +52,6 @@ class Readings:
         }
         for name, text in texts.items():
             set_text(self._texts[name], text)
-
-
-def set_theme(gui: viser.GuiApi) -> None:
-    """Give a page the accent of reports, and its controls their place."""
-    accent = rgb(LIGHT["accent"])
-    gui.configure_theme(
-        control_layout="collapsible", control_width="medium", show_logo=False, show_share_button=False, brand_color=accent
-    )
-
-
-def set_text(handle: Any, text: str) -> None:
-    """Change a text, if it is another one."""
-    if handle.content != text:
-        handle.content = text
 
 
 def status_line(state: Mapping[str, Any]) -> str:

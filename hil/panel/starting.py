@@ -14,6 +14,8 @@ from controller.planning import OPERATOR_TARGET
 from controller.planning.motions import load_motion
 from controller.planning.motions.built_in import NAMES
 from controller.planning.target import MOTION_SUFFIX
+from hil.panel.gui import set_text, tell_not_done
+from plant.checks import check_duration, check_rate
 from plant.errors import GoughError, InputError
 from plant.imu import PRESETS
 from plant.mechanism import load_in_space, preset_names
@@ -77,7 +79,7 @@ class RunForm:
     """
 
     def __init__(self, server: viser.ViserServer, start: Callable[[list[str]], None]) -> None:
-        self._server, self._start = server, start
+        self._start = start
         gui = server.gui
         self._note = gui.add_markdown("")
         mechanisms, targets = _files(load_in_space), [*_files(load_motion), *map(str, sorted(Path().glob("*.csv")))]
@@ -99,27 +101,29 @@ class RunForm:
             try:
                 self._start(self.options())
             except GoughError as error:
-                event.client.add_notification("Not started", str(error), color="red", auto_close_seconds=8.0)
+                tell_not_done(server, event.client, str(error))
 
         button.on_click(clicked)
 
     def say(self, text: str) -> None:
         """Tell what has become of the last run."""
-        if self._note.content != text:
-            self._note.content = text
+        set_text(self._note, text)
 
     def options(self) -> list[str]:
         """The options of the run that is asked for.
 
         Raises:
-            InputError: a browser has sent what it was not offered.
+            InputError: a browser has sent what it was not offered, or a duration or a rate that no run can have.
         """
         options = []
         for flag, (choice, names) in self.choices.items():
             if choice.value not in names:
                 raise InputError(f"there is no {flag[2:]} {choice.value!r} to choose: reload the page")
             options += [flag, choice.value]
-        return [*options, "--duration", f"{self._duration.value:g}", "--rate", f"{self._rate.value:g}", *_PATIENT]
+        duration, rate = float(self._duration.value), float(self._rate.value)
+        check_duration(duration)
+        check_rate(rate)
+        return [*options, "--duration", f"{duration:g}", "--rate", f"{rate:g}", *_PATIENT]
 
 
 def _first(name: str, names: Any) -> tuple[str, ...]:

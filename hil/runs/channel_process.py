@@ -25,6 +25,7 @@ from plant.compiled import Record
 from plant.mechanism import load_in_space
 
 MOST_CLIENTS = 16
+"""So many observers may watch, besides the operator; and so many clients may be about to say who they are."""
 
 
 def open_channel(host: str, port: int) -> socket.socket:

@@ -114,9 +114,10 @@ def run(
         stream: Record | None = shared_array(1, STREAM).reshape(()) if config.streamed else None
         # Forked before there is a pipe, which they would keep open.
         remarks: list[str] = []
-        planner = channel = at_end.enter_context(channel_process(config, records, link, stream, remarks.append))
-        if stream is not None and not config.operated:
-            planner = at_end.enter_context(_receiver(config, stream))
+        channel = at_end.enter_context(channel_process(config, records, link, stream, remarks.append))
+        planner: BaseProcess | None = None
+        if stream is not None:
+            planner = channel if config.operated else at_end.enter_context(_receiver(config, stream))
         ours, theirs = FORK.Pipe()
         recorders = Recorders(recording, records, link, ours, state.events)
         at_end.enter_context(_reported(state, recorders))

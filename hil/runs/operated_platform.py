@@ -51,8 +51,8 @@ _LEAST_JOG = 1e-5
 _OUT_OF_PLANE = 1e-9
 """A planar mechanism may be asked to leave its plane by so much, which is rounding [m or rad]."""
 
-_STEP_M, _STEP_RAD = 1e-3, np.radians(0.2)
-"""Poses of a way are checked so far apart."""
+_STEP_M, _STEP_RAD, _MOST_POSES = 1e-3, np.radians(0.2), 10_000
+"""Poses of a way are checked so far apart. One that is too long for so many of them leads far beyond all limits."""
 
 _OFFER_S = 0.01
 _PATIENCE_S = 1.0
@@ -428,7 +428,7 @@ def _scaled(move: Move, factor: float) -> Move:
 
 def _count(far: float, turned: float) -> int:
     """How many poses of a way are checked."""
-    return int(ceil(far / _STEP_M) + ceil(turned / _STEP_RAD) + 2)
+    return ceil(min(far / _STEP_M + turned / _STEP_RAD, _MOST_POSES)) + 2
 
 
 def _end_of(segments: Array) -> float:

@@ -10,6 +10,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from types import TracebackType
 from typing import Any, Self
 
@@ -40,7 +41,7 @@ class Operator:
     Args:
         address: of the channel.
         token: of the run; needed where it asks for one.
-        role: `operator` gives orders, `observer` watches.
+        role: `operator` gives orders, `observer` watches, and may end the run.
         name: that others are told.
         patience: how long an answer may take [s].
 
@@ -89,7 +90,9 @@ class Operator:
         self.close()
 
     def close(self) -> None:
-        """Leave the run; a move goes on to its end."""
+        """Leave the run; a move goes on to its end. A request of another thread ends by a `ChannelError`."""
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
     def ask(self, do: str, **what: Any) -> dict[str, Any]:
@@ -242,7 +245,8 @@ class Operator:
             try:
                 ready = bool(select.select([self._socket], [], [], left)[0])
                 received = self._socket.recv(MOST_LINE) if ready else None
-            except OSError:
+            except (OSError, ValueError):
+                # ValueError: another thread has closed it.
                 received = b""
             if received is None:
                 if lenient:

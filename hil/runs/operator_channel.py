@@ -4,8 +4,8 @@
                               checks an operator's requests, plans, and writes the plans into shared memory
                     loop      takes them as they come, as those of a streamed target
 
-Any number of observers may watch; one operator at a time gives orders. A run whose target is known beforehand cannot be moved,
-but its operator may end it.
+Observers may watch, and end the run; one operator at a time gives all other orders. A run whose target is known beforehand
+cannot be moved.
 """
 
 import asyncio
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from controller.frames import Move
 from controller.planning.motions.document import place_of
 from controller.planning.motions.elements import Place, ToolLimits
+from controller.planning.motions.waves import checked_number
 from controller.planning.points import HOME
 from controller.safety.causes import Cause
 from hil.loop.records import Link, StopRequest
@@ -43,7 +44,8 @@ from hil.runs.telemetry import (
 )
 from plant.checks import printable
 from plant.compiled import Record
-from plant.errors import GoughError, InputError
+from plant.errors import GoughError, InputError, PlanningError
+from plant.pose import checked_array
 
 TELEMETRY_HZ = 30.0
 
@@ -62,10 +64,13 @@ _HELLO_S = 5.0
 _MOST_WAITING = 1 << 18
 """Bytes that wait for a client that reads too slowly; it gets no telemetry meanwhile."""
 
+_MOST_WORDS = 1000
+"""Characters of an error, which may repeat what a client has sent."""
+
 _RESTING = {"time": 0.0, "moving": False, "jogging": False, "paused": False, "mode": "preparing"}
 
-_WATCHING = ("state", "margins", "watch")
-"""What an observer may ask for."""
+_FOR_ALL = ("state", "margins", "watch", "end", "emergency")
+"""What an observer may ask for: who sees that something goes wrong may end the run."""
 
 _ROLES = OPERATOR, OBSERVER = "operator", "observer"
 
@@ -123,7 +128,7 @@ class _Channel:
         self._timed = 0
         self._last_timing: Mapping[str, float] = {}
         self._clients: list[_Client] = []
-        self._waiting = 0
+        self._silent: list[asyncio.StreamWriter] = []
         self._measured, self._told_margins = -np.inf, list[dict[str, Any]]()
         self._doing: dict[str, Callable[[_Client, dict[str, Any]], dict[str, Any]]] = {
             "move": self._move, "follow": self._follow, "step": self._step_by, "jog": self._jog, "beat": self._beat,
@@ -151,58 +156,60 @@ class _Channel:
     # ------------------------------------------------------------------------------------------------------------ clients
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._waiting + len(self._clients) >= MOST_CLIENTS:
-            writer.close()
-            return
-        self._waiting += 1
+        client = None
         try:
             client = await self._greeted(reader, writer)
-        finally:
-            self._waiting -= 1
-        if client is None:
-            writer.close()
-            return
-        try:
-            while line := await reader.readline():
-                writer.write(encode(self._answer(client, line)))
+            if client is not None:
+                writer.write(encode({"gough": VERSION, "ok": True, **self._described()}))
                 await writer.drain()
-                # Between two requests the platform goes on, however many wait.
-                await asyncio.sleep(0)
-        except (OSError, ValueError):
-            # It has gone, or its line has no end.
+                while line := await _line(reader):
+                    writer.write(encode(self._answer(client, line)))
+                    await writer.drain()
+                    # Between two requests the platform goes on, however many wait.
+                    await asyncio.sleep(0)
+        except OSError:
+            # It has gone.
             pass
         finally:
-            self._clients.remove(client)
-            if client.role == OPERATOR and self._platform is not None:
-                self._platform.lose_operator()
+            if client is not None:
+                self._clients.remove(client)
+                if client.role == OPERATOR and self._platform is not None:
+                    self._platform.lose_operator()
             writer.close()
 
     async def _greeted(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> _Client | None:
-        """A client that may stay."""
-        kind, error, client = "malformed", "", None
-        try:
-            hello = decode(await asyncio.wait_for(reader.readline(), _HELLO_S))
-            kind, error = self._refusal(hello)
-            if not error:
-                client = _Client(writer, printable(str(hello.get("name", "")))[:80] or "somebody", str(hello["role"]))
-                # Before anything else is waited for, so that there is one operator.
-                self._clients.append(client)
-        except (GoughError, ValueError) as refusal:
-            error = str(refusal)
-        except (OSError, TimeoutError):
+        """A client that may stay, which has its place from here on; another one is told why not."""
+        line = await self._first_line(reader, writer)
+        if not line:
             return None
-        answer = {"gough": VERSION, "ok": client is not None}
-        with suppress(OSError):
-            writer.write(encode(answer | (self._described() if client is not None else {"kind": kind, "error": error})))
-            await writer.drain()
-        if client is not None and client.role == OPERATOR:
-            connection = writer.get_extra_info("socket")
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            # Of an operator whose machine has gone without a word, too, the place becomes free.
-            for option, value in (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3)):
-                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
-            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        try:
+            hello = decode(line)
+            kind, error = self._refusal(hello)
+        except GoughError as refusal:
+            hello, kind, error = {}, "malformed", str(refusal)
+        if error:
+            writer.write(encode({"gough": VERSION, "ok": False, "kind": kind, "error": error}))
+            return None
+        client = _Client(writer, printable(str(hello.get("name", "")))[:80] or "somebody", str(hello["role"]))
+        if client.role == OPERATOR:
+            _watch_over(writer.get_extra_info("socket"))
+        # Before anything else is waited for, so that there is one operator.
+        self._clients.append(client)
         return client
+
+    async def _first_line(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bytes:
+        """What a client says first; b"" if it says nothing in time."""
+        if len(self._silent) >= MOST_CLIENTS:
+            # The one that has said nothing for the longest makes room: nobody is kept out by those who say nothing.
+            self._silent.pop(0).transport.abort()
+        self._silent.append(writer)
+        try:
+            return await asyncio.wait_for(_line(reader), _HELLO_S)
+        except TimeoutError:
+            return b""
+        finally:
+            if writer in self._silent:
+                self._silent.remove(writer)
 
     def _refusal(self, hello: dict[str, Any]) -> tuple[str, str]:
         """Why a client may not stay: kind and words, "" if it may."""
@@ -213,12 +220,12 @@ class _Channel:
             return "token", "the token is wrong: give that of the run, with --token-file FILE or in GOUGH_TOKEN"
         if hello.get("role") not in _ROLES:
             return "malformed", f"the role is {printable(str(hello.get('role')))[:20]!r}; it is {' or '.join(_ROLES)}"
-        operator = next((each for each in self._clients if each.role == OPERATOR), None)
-        if hello["role"] == OPERATOR and operator is not None:
-            return (
-                "busy",
-                f"{operator.name} operates this run, and only one may: wait until that has gone, or watch as an observer",
-            )
+        others = [each for each in self._clients if each.role == hello["role"]]
+        if hello["role"] == OPERATOR and others:
+            who = others[0].name
+            return "busy", f"{who} operates this run, and only one may: wait until that has gone, or watch as an observer"
+        if len(others) >= MOST_CLIENTS:
+            return "busy", f"{len(others)} observers watch this run, and no more may: close one of them"
         return "", ""
 
     def _described(self) -> dict[str, Any]:
@@ -247,18 +254,18 @@ class _Channel:
                 about = None
                 raise InputError("id must be a number or a text")
             do = request.get("do")
-            if do not in self._doing:
+            if not isinstance(do, str) or do not in self._doing:
                 raise InputError(
                     f"there is nothing to do called {printable(str(do))[:40]!r}; there are {', '.join(self._doing)}"
                 )
-            if client.role != OPERATOR and do not in _WATCHING:
-                raise RefusedError("an observer gives no orders: connect as the operator")
+            if client.role != OPERATOR and do not in _FOR_ALL:
+                raise RefusedError("an observer gives no orders but to end the run: connect as the operator")
             return {"id": about, "ok": True, **self._doing[do](client, request)}
         except RefusedError as refusal:
             near = None if refusal.nearest is None else pose_message(refusal.nearest)
-            return {"id": about, "ok": False, "kind": "refused", "error": str(refusal), "nearest": near}
+            return {"id": about, "ok": False, "kind": "refused", "error": str(refusal)[:_MOST_WORDS], "nearest": near}
         except GoughError as error:
-            return {"id": about, "ok": False, "kind": "malformed", "error": str(error)}
+            return {"id": about, "ok": False, "kind": "malformed", "error": str(error)[:_MOST_WORDS]}
 
     @property
     def _moved(self) -> OperatedPlatform:
@@ -283,9 +290,7 @@ class _Channel:
     def _jog(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client
         rate = _move_in(request, "velocity", "turn_velocity")
-        deadman = request.get("deadman", DEADMAN_S)
-        if isinstance(deadman, bool) or not isinstance(deadman, int | float):
-            raise InputError("deadman must be a number")
+        deadman = checked_number(request.get("deadman", DEADMAN_S), "deadman")
         return {"duration": self._moved.jog(rate.translation, rate.rotation_vector, rate.axes, deadman)}
 
     def _beat(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
@@ -309,9 +314,11 @@ class _Channel:
 
     def _end(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
         del client, request
-        if self._platform is not None:
-            self._platform.stop()
         self._link[Link.STOP] = max(int(self._link[Link.STOP]), StopRequest.CONTROLLED)
+        if self._platform is not None:
+            # The loop comes to rest without it, too.
+            with suppress(PlanningError):
+                self._platform.stop()
         return {}
 
     def _emergency(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
@@ -336,9 +343,7 @@ class _Channel:
         return {"margins": self._told_margins}
 
     def _watch(self, client: _Client, request: dict[str, Any]) -> dict[str, Any]:
-        rate = request.get("rate", TELEMETRY_HZ)
-        if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 <= rate <= TELEMETRY_HZ:
-            raise InputError(f"rate is {printable(str(rate))[:20]}; it must be 0 to {TELEMETRY_HZ:g} Hz")
+        rate = checked_number(request.get("rate", TELEMETRY_HZ), "rate", 0.0, TELEMETRY_HZ)
         client.period = np.inf if rate == 0.0 else 1.0 / rate
         return {"rate": rate}
 
@@ -398,6 +403,22 @@ class _Channel:
         return self._last_timing
 
 
+async def _line(reader: asyncio.StreamReader) -> bytes:
+    """The next line of a client; b"" if it has gone, or its line has no end."""
+    try:
+        return await reader.readline()
+    except (OSError, ValueError):
+        return b""
+
+
+def _watch_over(connection: socket.socket) -> None:
+    """Let an operator's requests come at once, and its place become free if its machine goes without a word."""
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    for option, value in (("TCP_KEEPIDLE", 5), ("TCP_KEEPINTVL", 2), ("TCP_KEEPCNT", 3)):
+        connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+
+
 def _name_in(request: dict[str, Any], name: str) -> str | None:
     given = request.get(name)
     if not (given is None or isinstance(given, str)):
@@ -414,12 +435,9 @@ def _goal_in(request: dict[str, Any]) -> tuple[Place | str, str | None, str | No
 def _limits_in(request: dict[str, Any]) -> ToolLimits:
     """The limits of a move; speeds that are not given are the usual ones."""
     given = {name: request[name] for name in ToolLimits.__dataclass_fields__ if request.get(name) is not None}
-    for name, value in given.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise InputError(f"{name} must be a number")
     return ToolLimits(**{"speed": SPEED, "turn_speed": TURN_SPEED, **given})
 
 
 def _move_in(request: dict[str, Any], *names: str) -> Move:
-    straight, turn = (request.get(name, (0.0, 0.0, 0.0)) for name in names)
+    straight, turn = (checked_array(request.get(name, (0.0, 0.0, 0.0)), (3,), name) for name in names)
     return Move(straight, turn, _name_in(request, "axes"))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
+from sys import float_info
 
 import numpy as np
 
@@ -27,7 +28,7 @@ _MOST_SINES = 400
 
 def checked_number(value: float, name: str, least: float = -inf, most: float = inf) -> float:
     """A finite number within limits, or an `InputError`."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= float_info.max:
         raise InputError(f"{name} is {value!r}; it must be a finite number")
     if not least <= value <= most:
         bounds = f"at least {least:g}" if most == inf else f"{least:g} to {most:g}"

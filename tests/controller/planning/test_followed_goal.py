@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from controller.frames import ActiveFrames, Frames, Move
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.followed_goal import FollowedGoal
-from plant.errors import InputError
+from controller.planning.straight_way import StraightWay
+from plant.errors import InputError, PlanningError
 from plant.mechanism import load_in_space
 from plant.pose import Pose, rotation_from_vector, vector_from_rotation
 
@@ -69,9 +71,34 @@ def test_a_stop_ends_it_at_rest_where_no_later_goal_counts(hexapod):
     np.testing.assert_allclose(way.at(rests - 1e-6)[1], 0.0, atol=1e-6)
 
 
-def test_a_goal_that_is_turned_too_far_is_refused_and_the_way_goes_on(hexapod):
-    goal = np.array([0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
-    way = FollowedGoal(hexapod, hexapod.home, displaced(hexapod, goal), 0.05, 0.2)
-    with pytest.raises(InputError, match=r"turned by 2\.5 rad from home; at most 2"):
-        way.aim(displaced(hexapod, np.array([0.0, 0.0, 0.0, 2.5, 0.0, 0.0])), 0.1)
-    np.testing.assert_allclose(coordinates_of(hexapod, way.pose(way.duration)), goal, atol=1e-9)
+@pytest.mark.parametrize("goal", [[0.0, 0.0, 0.0, 2.5, 0.0, 0.0], [np.nan, 0.0, 0.0, 0.0, 0.0, 0.0]])
+def test_a_goal_that_is_refused_leaves_the_way_as_it_is(hexapod, goal):
+    """Turned too far, and one to which ruckig finds no way."""
+    goes_to = np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.1])
+    way = FollowedGoal(hexapod, hexapod.home, displaced(hexapod, goes_to), 0.05, 0.2)
+    way.aim(displaced(hexapod, goes_to), 0.1)
+    asked, end = 0.4, way.duration
+    before = [way.at(time) for time in np.linspace(asked, end, 20)]
+    with pytest.raises((InputError, PlanningError), match=r"turned by 2\.5 rad from home; at most 2|ruckig finds no way"):
+        way.aim(displaced(hexapod, np.array(goal)), asked)
+    assert way.duration == end
+    np.testing.assert_array_equal([way.at(time) for time in np.linspace(asked, end, 20)], before)
+    np.testing.assert_allclose(coordinates_of(hexapod, way.pose(end)), goes_to, atol=1e-9)
+
+
+def test_a_stop_to_which_there_is_no_plan_leaves_the_way_as_it_is(hexapod):
+    goal = np.array([0.03, 0.0, 0.0, 0.0, 0.0, 0.1])
+    straight = StraightWay(hexapod, ActiveFrames(Frames()), hexapod.home, Move(goal[:3], goal[3:]))
+    for way in (FollowedGoal(hexapod, hexapod.home, displaced(hexapod, goal), 0.05, 0.2), straight):
+        asked, end = 0.5 * way.duration, way.duration
+        before, jerk = way.at(asked), way._parameters.max_jerk
+        # ruckig itself refuses this.
+        way._parameters.max_jerk = [-1.0] * len(jerk)
+        with pytest.raises(PlanningError, match="ruckig finds no way"):
+            way.stop(asked)
+        assert not way.stopped and way.duration == end
+        np.testing.assert_array_equal(way.at(asked), before)
+        way._parameters.max_jerk = jerk
+        way.stop(asked)
+        assert way.stopped and way.duration < end
+        np.testing.assert_allclose(way.at(asked), before, atol=1e-9)

@@ -51,6 +51,23 @@ def test_the_form_offers_presets_and_the_files_of_the_folder_and_takes_nothing_e
         form.options()
 
 
+@pytest.mark.parametrize(
+    ("control", "value", "said"),
+    [
+        ("_duration", float("nan"), "the duration is nan s; it must be positive and finite"),
+        ("_duration", -1.0, "the duration is -1 s"),
+        ("_rate", 1e9, "the rate is 1e\\+09 Hz; it must be 50 to 4000 Hz"),
+        ("_rate", float("inf"), "the rate is inf Hz"),
+    ],
+)
+def test_numbers_that_no_run_can_have_are_refused_before_one_is_started(server, control, value, said):
+    """A browser need not keep to what its controls offer."""
+    form = RunForm(server, lambda options: None)
+    getattr(form, control).value = value
+    with pytest.raises(InputError, match=said):
+        form.options()
+
+
 def test_a_run_that_cannot_begin_says_why(server, capfd):
     run = StartedRun(["--mechanism", "nothing"])
     while run.status is None:

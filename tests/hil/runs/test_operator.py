@@ -1,29 +1,33 @@
 """An operator over real sockets: the channel in a process of its own, and a loop on the clock that follows its plans."""
 
+import asyncio
 import json
 import multiprocessing
 import os
 import signal
 import socket
+import struct
 import time
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 
 import numpy as np
 import pytest
+from ruckig import ControlInterface
 
 from controller.frames import ActiveFrames, Frames
 from controller.frames.tree import Frame
 from controller.inverse_kinematics import leg_lengths
+from controller.planning import straight_way
 from controller.planning.plan_handover import STREAM, STREAM_READER, rest, stream_cause, take_plan
 from controller.planning.points import load_points
 from controller.planning.segments import evaluate_reference
 from controller.safety.causes import Cause
 from controller.workspace import Demands, margins
 from hil.loop.records import LINK_SIZE, RECORD, Link, StopRequest, shared_array
-from hil.runs.channel_process import open_channel
+from hil.runs.channel_process import MOST_CLIENTS, open_channel
 from hil.runs.operated_platform import DEADMAN_S, OperatedPlatform, Workplace
 from hil.runs.operator import Operator, RequestRefusedError
-from hil.runs.operator_channel import serve_channel
+from hil.runs.operator_channel import _Channel, serve_channel
 from hil.runs.operator_messages import VERSION, ChannelError, channel_address, decode, encode, load_token
 from plant.errors import InputError
 from plant.mechanism import load_in_space
@@ -35,6 +39,7 @@ PATIENCE_NS = 10_000_000_000
 """A busy machine is not what is tested here."""
 CYCLES = 30_000
 TOKEN = "0123456789abcdef0123"
+HUGE = 10**400
 
 POINTS = """
 [points.left]
@@ -199,7 +204,7 @@ def test_what_cannot_be_reached_is_refused_with_the_nearest_pose_which_can(hexap
             ({"to": {"positon": [0, 0, 0]}}, "mean 'position'"),
             ({"to": "home", "frame": "table"}, "no frame 'table'"),
             ({"to": "home", "speed": -1}, "speed is -1"),
-            ({"to": "home", "speed": "fast"}, "speed must be a number"),
+            ({"to": "home", "speed": "fast"}, "speed is 'fast'; it must be a finite number"),
         ):
             with pytest.raises(RequestRefusedError, match=said) as refused:
                 operator.ask("move", **bad)
@@ -460,17 +465,81 @@ def test_one_operator_at_a_time_and_observers_who_give_no_orders(hexapod):
             observer.listen(0.5)
             assert observer.telemetry["mode"] == "preparing" and observer.telemetry["commanded"]["position"][2] == 0.35
             listen_to_the_newest(observer)
-            for order in ("move", "jog", "stop", "end", "emergency", "beat"):
-                with pytest.raises(RequestRefusedError, match="an observer gives no orders"):
+            for order in ("move", "follow", "step", "jog", "stop", "pause", "resume", "beat"):
+                with pytest.raises(RequestRefusedError, match="an observer gives no orders but to end the run"):
                     observer.ask(order)
             assert run.link[Link.STOP] == 0
+            # Whoever else operates.
+            observer.end()
+            assert run.link[Link.STOP] == StopRequest.CONTROLLED
+            observer.emergency()
+            assert run.link[Link.STOP] == StopRequest.QUICK
+        run.link[Link.STOP] = 0
         operator.end()
         assert run.link[Link.STOP] == StopRequest.CONTROLLED
         operator.emergency()
         assert run.link[Link.STOP] == StopRequest.QUICK
+        operator.end()
+        assert run.link[Link.STOP] == StopRequest.QUICK
         operator.close()
         time.sleep(0.2)
         run.operator().close()
+
+
+def test_a_run_ends_when_it_is_told_to_though_its_move_cannot_be_stopped(hexapod, monkeypatch):
+    """The channel's process plans with a ruckig that refuses all stops."""
+    planned = straight_way.calculate
+
+    def without_stops(otg, parameters, state, trajectory):
+        if parameters.control_interface == ControlInterface.Velocity:
+            parameters.max_jerk = [-1.0]
+        return planned(otg, parameters, state, trajectory)
+
+    monkeypatch.setattr(straight_way, "calculate", without_stops)
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        operator.move({"position": [0.03, 0.0, 0.0]}, speed=0.03, wait=False)
+        with pytest.raises(RequestRefusedError, match="ruckig finds no way"):
+            operator.stop()
+        operator.end()
+        assert run.link[Link.STOP] == StopRequest.CONTROLLED
+
+
+def test_a_client_that_resets_the_connection_while_it_is_greeted_keeps_no_place(hexapod):
+    """At each turn of the event loop, from the one in which its greeting is sent."""
+    link, records = np.zeros(LINK_SIZE, np.int64), np.zeros(8, RECORD)
+    workplace = Workplace(hexapod, ActiveFrames(Frames()), Demands(), {})
+    channel = _Channel(None, workplace, "circle", None, PERIOD, records, link)
+    hello = encode({"gough": VERSION, "role": "operator"})
+
+    async def greeted(address):
+        """Whether the operator's place is free soon."""
+        for _ in range(100):
+            reader, writer = await asyncio.open_connection(*address)
+            writer.write(hello)
+            ok = decode(await reader.readline())["ok"]
+            writer.close()
+            if ok:
+                return True
+            await asyncio.sleep(0.01)
+        return False
+
+    async def greet_and_reset(listener):
+        serving, address = asyncio.create_task(channel.run(listener)), listener.getsockname()
+        for turns in range(12):
+            with socket.create_connection(address) as raw:
+                # It is accepted meanwhile.
+                await asyncio.sleep(0.01)
+                raw.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                raw.sendall(hello)
+                for _ in range(turns):
+                    await asyncio.sleep(0)
+            assert await greeted(address), f"reset after {turns} turns"
+        link[Link.DONE] = 1
+        await serving
+
+    with open_channel("127.0.0.1", 0) as listener:
+        asyncio.run(greet_and_reset(listener))
 
 
 def said(address, *lines):
@@ -486,6 +555,59 @@ def said(address, *lines):
         except (TimeoutError, ConnectionResetError, BrokenPipeError):
             pass
     return [json.loads(line) for line in answer.splitlines()]
+
+
+def test_neither_who_says_nothing_nor_all_the_observers_keep_the_operator_out(hexapod):
+    with running(hexapod, token=TOKEN) as run, ExitStack() as others:
+        address = channel_address(run.address, None)
+        silent = [others.enter_context(socket.create_connection(address)) for _ in range(3 * MOST_CLIENTS)]
+        watching = [others.enter_context(run.operator(role="observer")) for _ in range(MOST_CLIENTS)]
+        with pytest.raises(ChannelError, match=f"{MOST_CLIENTS} observers watch this run, and no more may") as refused:
+            run.operator(role="observer")
+        assert refused.value.kind == "busy"
+        silent += [others.enter_context(socket.create_connection(address)) for _ in range(MOST_CLIENTS)]
+        with run.operator() as operator:
+            begun(operator)
+        # The first ones have made room.
+        silent[0].settimeout(5.0)
+        with suppress(ConnectionResetError):
+            assert silent[0].recv(1) == b""
+        watching[0].close()
+        until = time.monotonic() + 5.0
+        while True:
+            with suppress(ChannelError):
+                run.operator(role="observer").close()
+                break
+            assert time.monotonic() < until
+            time.sleep(0.02)
+
+
+MALFORMED = [
+    {"do": []}, {"do": {}}, {"do": None}, {"do": "state", "id": 1.5}, {"do": "watch", "rate": HUGE}, {"do": "jog"},
+    {"do": "jog", "velocity": [0.01, 0.0, 0.0], "deadman": HUGE}, {"do": "jog", "velocity": [0.01, 0.0, 0.0], "deadman": True},
+    {"do": "jog", "velocity": [0.01, 0.0]}, {"do": "jog", "turn_velocity": "fast"}, {"do": "jog", "velocity": [HUGE, 0, 0]},
+    {"do": "step", "translation": [0.001, 0.002]}, {"do": "step", "rotation": None}, {"do": "step", "translation": {"x": 1}},
+    {"do": "step", "translation": [[0.001], [0.0, 1.0], 0.0]}, {"do": "step", "translation": [1e200, 0.0, 0.0]},
+    {"do": "step", "translation": [0.0] * 10_000}, {"do": "move", "to": "home", "speed": HUGE}, {"do": "move", "to": [0, 0, 0]},
+    {"do": "move", "to": {"position": [HUGE, 0, 0]}}, {"do": "move", "to": {"position": [0, 0, 0], "relative": []}},
+    {"do": "move", "to": 3, "frame": []}, {"do": "follow"}, {"do": "follow", "to": {"rotation": [1e308, 1e308, 1e308]}},
+]  # fmt: skip
+"""What no client should send, and one of another maker might."""
+
+
+@pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
+def test_whatever_is_asked_for_is_answered_and_the_client_keeps_its_connection(name):
+    with running(load_in_space(name)) as run, run.operator() as operator:
+        begun(operator)
+        for request in MALFORMED:
+            operator._send({"id": 7, **request} if isinstance(request["do"], str) else request)
+            answer = operator._line(time.monotonic() + 5.0)
+            assert answer["ok"] is False and answer["kind"] in ("malformed", "refused"), (request, answer)
+            assert len(answer["error"]) <= 1000
+        # Much too far, which costs no more than any other way that is refused.
+        with pytest.raises(RequestRefusedError, match="stroke of leg"):
+            operator.step((1e6 if name == "hexapod" else 0.0, 1e6, 0.0))
+        assert operator.ask("state")["telemetry"]["moving"] is False and run.cause[0] == Cause.NONE
 
 
 def test_a_token_is_asked_for_and_nobody_else_gets_in(hexapod):
