@@ -33,7 +33,7 @@ from controller.workspace.limits import (
 from controller.workspace.margins import Margins, margins
 from controller.workspace.nearest import Nearest, nearest_reachable
 from plant.checks import LEAST_TIME_SCALE
-from plant.errors import UnreachableError
+from plant.errors import MissingPackageError, UnreachableError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, vector_from_rotation
 
@@ -243,7 +243,7 @@ def _result(
         worst = tally.closest[tally.worst][1]
         try:
             nearest = nearest_reachable(mechanism, worst.pose, tally.demands)
-        except UnreachableError:
+        except (UnreachableError, MissingPackageError):
             nearest = None
     closest = tuple(excess for _, excess in tally.closest.values())
     return TargetCheck(target, duration, first, worst, nearest, closest, tuple(peaks), reference, mechanism)

@@ -7,6 +7,7 @@ import numpy as np
 from controller.workspace.limits import USUAL, Demands, spread_of
 from controller.workspace.margins import checked_poses, margins
 from plant.errors import UnreachableError
+from plant.extras import check_installed
 from plant.mechanism import Mechanism
 from plant.mechanism.loads import moving_axes
 from plant.pose import Array, Pose, rotation_from_vector, vector_from_rotation
@@ -53,7 +54,9 @@ def nearest_reachable(mechanism: Mechanism, pose: Pose, demands: Demands | None 
     Raises:
         UnreachableError: none is found, as not even the start is reachable.
         InputError: as for `margins`.
+        MissingPackageError: scipy is not installed.
     """
+    check_installed("scipy")
     demands, start = demands or USUAL, start or mechanism.require_home()
     checked_poses(mechanism, pose.position[None], pose.rotation[None])
     search = _Search(mechanism, pose, demands)

@@ -27,7 +27,7 @@ from controller.safety.causes import Cause
 from controller.workspace import Demands, PoseGuard, first_excess, nearest_reachable, pose_text
 from hil.runs.target_stream import LEAD_S, PlanOffers, load_handover
 from plant.compiled import Record
-from plant.errors import GoughError, InputError, UnreachableError
+from plant.errors import GoughError, InputError, MissingPackageError, UnreachableError
 from plant.mechanism import Mechanism
 from plant.pose import Array, Pose
 
@@ -380,7 +380,7 @@ class OperatedPlatform:
         goal = way.poses(np.array(1.0))
         try:
             nearest = nearest_reachable(mechanism, goal, demands, self.pose)
-        except UnreachableError:
+        except (UnreachableError, MissingPackageError):
             raise RefusedError(f"{excess.text}: choose another place") from None
         if nearest.distance == nearest.angle == 0.0:
             raise RefusedError(f"on the straight way there, {excess.text}: go there by another pose", nearest.pose)
@@ -428,7 +428,8 @@ def _scaled(move: Move, factor: float) -> Move:
 
 def _count(far: float, turned: float) -> int:
     """How many poses of a way are checked."""
-    return ceil(min(far / _STEP_M + turned / _STEP_RAD, _MOST_POSES)) + 2
+    count: int = ceil(min(far / _STEP_M + turned / _STEP_RAD, _MOST_POSES)) + 2
+    return count
 
 
 def _end_of(segments: Array) -> float:

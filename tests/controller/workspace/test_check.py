@@ -24,7 +24,7 @@ from controller.workspace.limits import BEYOND, KINDS
 from hil.command_line import main
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
-from plant.errors import UnreachableError
+from plant.errors import MissingPackageError, UnreachableError
 from plant.mechanism.documents import mechanism_from_text
 from plant.pose import Pose, quaternion_from_rotation, rotation_from_vector
 from tests.controller.planning.test_stream_planner import Follower
@@ -179,6 +179,17 @@ def test_a_run_is_refused_before_it_moves_and_the_command_tells_the_same(tmp_pat
     assert str(refused.value) in capsys.readouterr().out
     # Within the joints' cones it goes.
     assert main(["motion", str(csv), "--mechanism", str(path), "--duration", "1"]) == 0
+
+
+def test_without_scipy_a_refusal_names_its_limit_and_no_nearest_pose(monkeypatch, hexapod):
+    """A base installation lacks it, and a first user's target is often out of reach."""
+    monkeypatch.setattr("plant.extras.find_spec", lambda package: None)
+    config = SimulationConfig(target=lambda t: [0.0, 0.0, 0.2, 0.0, 0.0, 0.0], duration=0.1)
+    with pytest.raises(UnreachableError, match="stroke of leg") as refused:
+        simulate(config)
+    assert "nearest" not in str(refused.value) and "scipy" not in str(refused.value)
+    with pytest.raises(MissingPackageError, match=r"needs scipy.*gough\[calibrate\]"):
+        nearest_reachable(hexapod, hexapod.home)
 
 
 def test_every_kind_of_limit_has_its_cause():
