@@ -260,12 +260,15 @@ def integrity_remark(
     moved, turned = ({imu: np.linalg.norm(shift[part], 2) for imu, shift in shifts.items()} for part in (slice(3), slice(3, 6)))
     suspects = blind or [*measured]
     far, names = max(suspects, key=lambda imu: moved[imu]), ", ".join(map(str, measured))
-    whose = "one of them" if len(suspects) == len(measured) else f"IMU {', '.join(map(str, suspects))}"
+    complete = len(measured) == len(imus_of(mechanism))
+    which = f"the IMUs {names} hardly check each other: an error of one of them"
+    if len(suspects) < len(measured):
+        which = f"the others hardly check IMU {', '.join(map(str, suspects))}: an error there"
     told = "is told, but not whose it is" if spare >= components and not blind else "is not told"
-    remedy = "" if len(measured) == len(imus_of(mechanism)) else ": add IMUs"
+    remedy = "docs/sensor_sets.md has sensors that would tell more" if complete else "add IMUs"
     return (
-        f"the IMUs {names} hardly check each other: an error of {whose} {told}, and 1 deg of IMU {far} moves the pose by "
-        f"{1e3 * moved[far]:.1f} mm and {np.degrees(turned[far]):.1f} deg{remedy}"
+        f"{which} {told}, and 1 deg of IMU {far} moves the pose by {1e3 * moved[far]:.1f} mm and {np.degrees(turned[far]):.1f} deg: "
+        f"{remedy}"
     )
 
 

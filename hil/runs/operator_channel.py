@@ -58,6 +58,9 @@ _MARGINS_S = 0.1
 _TIMING_S, _TIMED_S = 1.0, 0.2
 """Of how many seconds the timing is told, and how long a timing is told on: it reads as many records of the loop's memory."""
 
+_FAREWELL_S = 1.0
+"""How long clients may take to read what the run has said last."""
+
 _HELLO_S = 5.0
 """How long a client may take to say who it is."""
 
@@ -150,8 +153,15 @@ class _Channel:
         self._look(np.inf)
         self._tell({"event": RUN_ENDED})
         server.close()
+        for silent in self._silent:
+            silent.transport.abort()
         for client in self._clients:
             client.writer.close()
+        # Their tasks end with their connections; one that is cut off prints a traceback.
+        with suppress(TimeoutError):
+            async with asyncio.timeout(_FAREWELL_S):
+                while self._clients or self._silent:
+                    await asyncio.sleep(_STEP_S)
 
     # ------------------------------------------------------------------------------------------------------------ clients
 

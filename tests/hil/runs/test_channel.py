@@ -63,6 +63,22 @@ def test_all_may_watch_and_end_the_run_but_nobody_may_move_it():
         assert observer.events[-1]["event"] == "the run has ended"
 
 
+def test_a_run_that_ends_while_clients_are_there_prints_nothing(capfd):
+    """One that watches, one that operates, and one that has said nothing yet."""
+    with Beside().served() as run:
+        host, port = run.config.channel.split(":")
+        with (
+            Operator(run.config.channel, role="observer") as observer,
+            Operator(run.config.channel),
+            socket.create_connection((host, int(port))),
+        ):
+            observer.watch()
+            run.link[Link.DONE] = 1
+            run.process.join(10.0)
+            assert run.process.exitcode == 0
+    assert capfd.readouterr().err == ""
+
+
 def test_a_taken_address_is_a_remark_by_default_and_an_error_where_it_was_asked_for():
     with socket.socket() as other:
         # Another run may have it already.

@@ -89,8 +89,8 @@ def test_gains_that_do_not_suit_and_imus_that_hardly_check_each_other_are_said_b
     path.write_text('based_on = "hexapod"\n[control]\nproportional = 120.0\nintegral = 400.0\n')
     result = simulate(SimulationConfig(str(path), duration=0.05, imus=(0, 1, 3, 4, 6)), say=said.append)
     assert said == result.summary()["remarks"]
-    assert [remark[:9] for remark in said] == ["the gains", "the IMUs "]
-    assert "do not suit" in said[0] and "hardly check each other" in said[1]
+    assert [remark[:9] for remark in said] == ["the gains", "the other"]
+    assert "do not suit" in said[0] and "the others hardly check IMU 6" in said[1]
 
 
 @pytest.mark.parametrize(("own", "slack"), [("", 0.03), ("[drives]\nslack = 0.004\n", 0.004)])
