@@ -431,7 +431,7 @@ def _scaled(move: Move, factor: float) -> Move:
 
 def _count(far: float, turned: float) -> int:
     """How many poses of a way are checked."""
-    return ceil(min(far / _STEP_M + turned / _STEP_RAD, _MOST_POSES)) + 2
+    return int(ceil(min(far / _STEP_M + turned / _STEP_RAD, _MOST_POSES))) + 2
 
 
 def _end_of(segments: Array) -> float:
