@@ -34,7 +34,7 @@ class LivePanel:
     """
 
     def __init__(self, server: viser.ViserServer, address: str, token: str | None) -> None:
-        self._server, self._address, self._token = server, address, token
+        self._server = server
         self._watching = Operator(address, token, role="observer", name="gough panel")
         self._run = self._watching.run
         # What a run before it has left.

@@ -336,7 +336,10 @@ class OperatedPlatform:
             where, frame, tool = point.place, frame or point.frame, tool or point.tool
         frames = self._place.frames_of(frame, tool)
         there = where.after(Pose(*frames.to_target(self._place.home, self.commanded)))
-        return frames, frames.from_target(self._place.home, there.position, there.rotation)
+        goal = frames.from_target(self._place.home, there.position, there.rotation)
+        if not (np.isfinite(goal.position).all() and np.isfinite(goal.rotation).all()):
+            raise InputError("the place is too far away to be computed: give its position in m and its rotation in rad")
+        return frames, goal
 
     def _require_plane(self, frames: ActiveFrames, move: Move) -> None:
         """Refuse a move out of the plane of a planar mechanism."""

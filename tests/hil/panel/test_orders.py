@@ -1,6 +1,8 @@
 """Browsers that operate a run and end it, over real websockets; the channel is in a process of its own, beside a loop."""
 
 import gc
+import os
+import signal
 import threading
 import time
 import weakref
@@ -152,8 +154,12 @@ def test_sliders_and_places_are_in_the_frames_of_the_run(hexapod):
 def test_a_wish_for_a_run_that_comes_too_late_is_dropped_and_told(hexapod):
     with running(hexapod) as run, served(run.address) as (server, page, port), Browser("127.0.0.1", port) as browser:
         waited(server.get_clients)
-        page.start(["--mechanism", "nothing"])
+        # It listens, and does not answer yet.
+        os.kill(run.channel.pid, signal.SIGSTOP)
         with shown(page):
+            time.sleep(0.2)
+            page.start(["--mechanism", "nothing"])
+            os.kill(run.channel.pid, signal.SIGCONT)
             waited(lambda: browser.notices == [f"a run answers at {run.address} already: no other one was started"])
             waited(lambda: browser.has("Step +"))
 
