@@ -266,10 +266,8 @@ def integrity_remark(
         which = f"the others hardly check IMU {', '.join(map(str, suspects))}: an error there"
     told = "is told, but not whose it is" if spare >= components and not blind else "is not told"
     remedy = "docs/sensor_sets.md has sensors that would tell more" if complete else "add IMUs"
-    return (
-        f"{which} {told}, and 1 deg of IMU {far} moves the pose by {1e3 * moved[far]:.1f} mm and {np.degrees(turned[far]):.1f} deg: "
-        f"{remedy}"
-    )
+    moves = f"{1e3 * moved[far]:.1f} mm and {np.degrees(turned[far]):.1f} deg"
+    return f"{which} {told}, and 1 deg of IMU {far} moves the pose by {moves}: {remedy}"
 
 
 def measured_rows(

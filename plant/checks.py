@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from math import inf
+from numbers import Integral
 
 from plant.errors import InputError
 
@@ -33,8 +34,8 @@ def check_time_scale(factor: float) -> None:
 
 def checked_seed(seed: int) -> int:
     """A seed of random numbers: not negative and of 63 bits at most, or an `InputError`."""
-    if not 0 <= seed < 2**63:
-        raise InputError(f"the seed is {seed}; it must lie between 0 and 2^63 - 1")
+    if not isinstance(seed, Integral) or not 0 <= seed < 2**63:
+        raise InputError(f"the seed is {seed}; it must be a whole number between 0 and 2^63 - 1")
     return seed
 
 
@@ -47,4 +48,6 @@ def nearest(text: str, names: Iterable[str]) -> str:
     """A question for the name that a mistyped text may mean; "" if none is near."""
     from difflib import get_close_matches
 
-    return "".join(f"; did you mean {name!r}?" for name in get_close_matches(text, names, 1))
+    names = [*names]
+    near = [name for name in names if len(text) > 2 and name.startswith(text)] or get_close_matches(text, names, 1)
+    return f"; did you mean {near[0]!r}?" if near else ""

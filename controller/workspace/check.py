@@ -61,7 +61,10 @@ class Excess(NamedTuple):
         """In words: limit, value, bound and time."""
         value, bound, unit = self.shown
         unit, side = f" {unit}" if unit else "", "most" if value > bound else "least"
-        return f"{self.limit.text} would be {value:.5g}{unit} at {self.time:.3f} s, and must be at {side} {bound:.5g}{unit}"
+        # So many digits that the two differ.
+        digits = next((n for n in range(5, 12) if f"{value:.{n}g}" != f"{bound:.{n}g}"), 12)
+        texts = [f"{each:.{digits}g}{unit}" for each in (value, bound)]
+        return f"{self.limit.text} would be {texts[0]} at {self.time:.3f} s, and must be at {side} {texts[1]}"
 
     @property
     def shown(self) -> tuple[float, float, str]:

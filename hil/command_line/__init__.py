@@ -103,7 +103,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
             _command(heading, name).build(command)
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
-        flags = re.findall(r"--[\w-]+", options.parser.format_usage())
+        flags = re.findall(r"(?<=[\[ ])[-+]{1,2}[a-z][\w-]*", options.parser.format_usage())
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}{nearest(unknown[0], flags)}")
     return options
 

@@ -103,8 +103,9 @@ class LivePanel:
             self._button("Pause", self._ordered(lambda operator: operator.pause()))
             self._button("Go on", self._ordered(lambda operator: operator.resume(wait=False)))
         with gui.add_folder("End the run"):
+            gui.add_markdown("The quick stop is software, and no emergency stop.")
             self._end_button("Controlled stop", lambda operator: operator.end(), "orange")
-            self._end_button("Software quick stop (no emergency stop)", lambda operator: operator.emergency(), "red")
+            self._end_button("Software quick stop", lambda operator: operator.emergency(), "red")
         self._tabs = gui.add_tab_group()
         with self._tabs.add_tab("Readings"):
             self._readings = Readings(self._server, self.machine, self._scene, self._run["frames"], self._status)

@@ -57,6 +57,7 @@ from plant.mechanism import load_spatial
 _BUFFER_S = 8.0
 _LEAST_RECORDS = 1024
 _LOOK_S = 0.1
+_MISSED_REMEDY = ": prepare the machine (docs/real_time.md), stop other programs, lower --rate, or raise --most-missed"
 _STOPPING = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
 
 
@@ -156,7 +157,8 @@ def run(
     if cause not in (Cause.END_OF_MOTION, Cause.STOP_REQUESTED):
         quickly = Cause(cause).reaction >= Reaction.QUICK_STOP
         how = "stopped on the brakes" if quickly else "stopped before its time"
-        raise RunStoppedError(f"{how} at cycle {cycle}: {summary['cause']}", summary)
+        remedy = _MISSED_REMEDY if cause == Cause.MISSED_PERIODS else ""
+        raise RunStoppedError(f"{how} at cycle {cycle}: {summary['cause']}{remedy}", summary)
     return summary
 
 

@@ -265,7 +265,10 @@ class OperatedPlatform:
         """End the run by a controlled stop if the operator has gone while it jogged; forget what was paused."""
         self.paused = False
         if self.jogging:
-            fail_stream(self._stream, Cause.OPERATOR_LOST, -1, time.monotonic() - self._beaten, self._deadman)
+            silent = time.monotonic() - self._beaten
+            # One whose connection has closed was not silent for too long.
+            told = (silent, self._deadman) if silent > self._deadman else (np.nan, np.nan)
+            fail_stream(self._stream, Cause.OPERATOR_LOST, -1, *told)
             self.end(Cause.OPERATOR_LOST.short)
 
     def end(self, reason: str) -> None:

@@ -28,8 +28,8 @@ def test_a_duration_that_never_ends_or_begins_is_refused(duration):
 
 def test_a_seed_is_returned_and_has_63_bits():
     assert [checked_seed(seed) for seed in (0, 7, 2**63 - 1)] == [0, 7, 2**63 - 1]
-    for seed in (-1, 2**63):
-        with pytest.raises(InputError, match=f"the seed is {seed}; it must lie between 0 and"):
+    for seed in (-1, 2**63, 1.5):
+        with pytest.raises(InputError, match=f"the seed is {seed}; it must be a whole number between 0 and"):
             checked_seed(seed)
 
 
@@ -49,3 +49,6 @@ def test_a_foreign_text_does_nothing_to_a_terminal(text, shown):
 def test_the_nearest_name_is_asked_for():
     assert nearest("hexapot", ("6-5", "hexapod")) == "; did you mean 'hexapod'?"
     assert nearest("xyz", ("6-5", "hexapod")) == ""
+    # The beginning of a name is near it, however short.
+    assert nearest("sim", ("fmu", "simulate")) == "; did you mean 'simulate'?"
+    assert nearest("s", ("fmu", "simulate")) == ""

@@ -101,7 +101,7 @@ def test_any_browser_ends_the_run_at_once_though_another_program_operates_it(hex
         waited(lambda: "a program operates this run" in "".join(browser.notices))
         browser.press("Controlled stop")
         waited(lambda: run.link[Link.STOP] == StopRequest.CONTROLLED)
-        browser.press("Software quick stop (no emergency stop)")
+        browser.press("Software quick stop")
         waited(lambda: run.link[Link.STOP] == StopRequest.QUICK)
         assert len(browser.notices) == 1
 
