@@ -146,7 +146,7 @@ def test_a_record_becomes_a_state_and_words(hexapod, machine):
     frames = ActiveFrames(Frames())
     state = state_message(record, frames)
     assert state["imus"] == [0, 1, 2, 3, 4, 6] and "truth" not in state
-    assert "| estimate | 1.00 | -2.00 | 350.00 | 0.000 | 0.000 | 0.000 |" in pose_table(state)
+    assert "| estimate | 1.00 | -2.00 | 350.00 | 0.000 | 0.000 | 0.000 |" in table_of(state)
     assert "protection level 1.50 mm, inf deg" in error_line(state)
     rows = leg_table(state, machine).splitlines()
     assert rows[7].endswith("| **out** |") and rows[2].endswith("| used |")
@@ -166,7 +166,7 @@ def test_poses_are_told_in_any_frame_of_the_run_on_the_base(hexapod):
     choices = frames_to_choose(frames_message(frames))
     assert list(choices) == ["tip in table", "platform in table", "tip in base", "platform in base"]
     state = {"pose": {"position": [0.01, 0.0, 0.35], "rotation": [0.0, 0.0, 0.1]}}
-    assert "| estimate | 10.00 | 0.00 | 150.00 | 0.000 | 0.000 | 5.730 |" in pose_table(state, choices["tip in table"])
+    assert "| estimate | 10.00 | 0.00 | 150.00 | 0.000 | 0.000 | 5.730 |" in table_of(state, choices["tip in table"])
     assert "| estimate | 10.00 | 0.00 | 50.00 |" in table_of(state, choices["platform in table"])
     assert "| estimate | 10.00 | 0.00 | 350.00 |" in table_of(state, choices["platform in base"])
     assert list(frames_to_choose(frames_message(ActiveFrames(Frames())))) == ["platform in base"]
