@@ -36,6 +36,7 @@ class LivePanel:
     def __init__(self, server: viser.ViserServer, address: str, token: str | None) -> None:
         self._server = server
         self._watching = Operator(address, token, role="observer", name="gough panel")
+        self._watching.watch()
         self._run = self._watching.run
         # What a run before it has left.
         server.gui.reset()
@@ -65,7 +66,6 @@ class LivePanel:
 
     def run(self, over: threading.Event) -> str:
         """Show the run until it ends or `over` is set; the picture of its last state stays. Returns how it ended, in words."""
-        self._watching.watch()
         running = True
         while running and not over.is_set():
             try:

@@ -58,6 +58,7 @@ class Orders:
         self._jogging = self._unsettled = False
         self._newest: dict[int, Mapping[str, Any]] = {}  # of the places that each browser would have followed
         self._given = 0
+        self._told, self._told_at = (-1, ""), 0.0
         self._lock = threading.Lock()
         self._queue: queue.SimpleQueue[tuple[Any, Callable[[Any], Any]] | None] = queue.SimpleQueue()
         threading.Thread(target=self._work, daemon=True).start()
@@ -131,9 +132,16 @@ class Orders:
         try:
             do(client)
         except (ChannelError, _NoControlError) as error:
-            tell_not_done(self._server, client, str(error))
+            self._tell(client, str(error))
             if isinstance(error, ChannelError) and not isinstance(error, RequestRefusedError):
                 self.leave(client)
+
+    def _tell(self, client: Any, why: str) -> None:
+        """Tell why an order is not done: once while a button is held, which gives it twenty times a second."""
+        told, at = (client.client_id, why), time.monotonic()
+        if told != self._told or at - self._told_at > RELEASED_S:
+            tell_not_done(self._server, client, why)
+        self._told, self._told_at = told, at
 
     def _operator_of(self, client: Any) -> Operator:
         operator = self._operator
