@@ -1,5 +1,6 @@
 """Where a mechanism can go: margins of poses, travel along a direction, and the largest region about a pose."""
 
+from controller.pose_limits import GEOMETRY_ALONE, KINDS, LIMITS, Demands, Limit, Margins, margins, margins_at
 from controller.workspace.check import (
     Excess,
     PoseGuard,
@@ -21,8 +22,6 @@ from controller.workspace.extent import (
     slice_about,
 )
 from controller.workspace.figures import geometry_figures
-from controller.workspace.limits import GEOMETRY_ALONE, KINDS, LIMITS, Demands, Limit
-from controller.workspace.margins import Margins, margins, margins_at
 from controller.workspace.nearest import Nearest, nearest_reachable
 from controller.workspace.travel import Travel, pose_along, travel, travels
 

@@ -19,7 +19,7 @@ from controller.planning.offline_planner import Reference, plan
 from controller.planning.pace import exact_peaks, least_time_scale, target_peaks
 from controller.planning.segments import lengths_along
 from controller.planning.target import Target
-from controller.workspace.limits import (
+from controller.pose_limits.limits import (
     BEYOND,
     JACOBIAN,
     LEAST_JACOBIAN,
@@ -30,7 +30,7 @@ from controller.workspace.limits import (
     least_conditioning,
     space_of,
 )
-from controller.workspace.margins import Margins, margins
+from controller.pose_limits.margins import Margins, margins
 from controller.workspace.nearest import Nearest, nearest_reachable
 from plant.checks import LEAST_TIME_SCALE
 from plant.errors import MissingPackageError, UnreachableError

@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.workspace.limits import LIMITS, Demands, Limit
-from controller.workspace.margins import margins
+from controller.pose_limits.limits import LIMITS, Demands, Limit
+from controller.pose_limits.margins import margins
 from controller.workspace.travel import pose_along, travels
 from plant.errors import InputError
 from plant.mechanism import Mechanism

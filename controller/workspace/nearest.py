@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.workspace.limits import USUAL, Demands, spread_of
-from controller.workspace.margins import checked_poses, margins
+from controller.pose_limits.limits import USUAL, Demands, spread_of
+from controller.pose_limits.margins import checked_poses, margins
 from plant.errors import UnreachableError
 from plant.extras import check_installed
 from plant.mechanism import Mechanism

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controller.imu_set import conditionings
 from controller.least_squares import extreme_singular_values
-from controller.workspace.limits import (
+from controller.pose_limits.limits import (
     BASE_PLATE,
     BASE_SWING,
     BETWEEN,
@@ -33,7 +33,7 @@ from controller.workspace.limits import (
     scales_of,
     space_of,
 )
-from controller.workspace.margins import WORK, find_margins, scale_jacobian
+from controller.pose_limits.margins import WORK, find_margins, scale_jacobian
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import TINY
 from plant.errors import InputError, UnreachableError

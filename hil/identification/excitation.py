@@ -12,8 +12,8 @@ import numpy as np
 from controller.planning.motions import Motion, PlannedMotion, Sine, Wave, plan_motion
 from controller.planning.motions.splines import extrema_of
 from controller.planning.motions.waves import AXES, MOST_HZ
-from controller.workspace.limits import GEOMETRY_ALONE, LIMITS
-from controller.workspace.margins import margins
+from controller.pose_limits.limits import GEOMETRY_ALONE, LIMITS
+from controller.pose_limits.margins import margins
 from hil.calibration.drives import within_drives
 from plant.checks import check_rate
 from plant.errors import InputError, UnreachableError

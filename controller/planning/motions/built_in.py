@@ -6,11 +6,14 @@ from math import inf
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from controller.direct_kinematics import poses_from_lengths
 from controller.inverse_kinematics import leg_lengths, sample_workspace
+from controller.pose_limits import LIMITS, margins
 from plant.errors import InputError
 from plant.mechanism import Mechanism
-from plant.pose import Array, rotation_from_vector, vector_from_rotation
+from plant.pose import Array, Pose, rotation_from_vector, vector_from_rotation
 
 SAMPLE_PERIOD_S = 0.01
 MARGIN_S = 0.1
@@ -24,6 +27,12 @@ _SHAKING_HZ = 0.8
 _SHAKING_SHARE = 0.85
 _FADE_S = 1.0
 _STEP_S = 2.0
+
+_RESERVE = 0.1
+"""Share of what home leaves of the swing of a joint or of a clearance, which the fitted motions leave, too."""
+_WITH_RESERVE = np.array([limit.kind.endswith(("swing", "plate")) or limit.kind == "legs" for limit in LIMITS])
+_ON_A_WAY = 50
+"""Poses that are tried on the way from one rest to the next."""
 
 Poses = tuple[Array, Array, Array]
 """Times (N,) [s], positions (N, 3) [m] and rotations (N, 3, 3)."""
@@ -98,9 +107,14 @@ def rests(mechanism: Mechanism, duration: float, share: float = 0.8, size: float
     """Poses to rest at for `REST_S` each, home first, as different as this share of the strokes and the box allow.
 
     They are chosen among random poses of the workspace, whose way from home is shortened to this `size`, and to the box:
-    without shortening, hardly any pose is within a small share.
+    without shortening, hardly any pose is within a small share. The poses, the ways from one to the next, and those home are
+    within all limits.
+
+    Raises:
+        InputError: the mechanism has no home or no limits, or its limits leave no pose.
     """
     limits, home = mechanism.require_limits(), mechanism.require_home()
+    inside = _Inside(mechanism)
     lengths = leg_lengths(mechanism, home.position, home.rotation)
     positions, rotations = sample_workspace(mechanism, _REST_CHOICE, seed=0)
     if size < 1.0:
@@ -113,21 +127,50 @@ def rests(mechanism: Mechanism, duration: float, share: float = 0.8, size: float
         rotations = np.array([rotation_from_vector(turn) @ home.rotation for turn in _shortened(turns, box.rotation)])
     drawn = leg_lengths(mechanism, positions, rotations)
     middle, half = limits.stroke.mean(axis=1), 0.5 * (limits.stroke[:, 1] - limits.stroke[:, 0])
-    inside = (np.abs(drawn - middle) <= share * half).all(axis=1)
-    positions, rotations, drawn = positions[inside], rotations[inside], drawn[inside]
-    if not len(drawn):
-        raise InputError(f"the workspace of {mechanism.name!r} has no poses within {share:g} of the strokes")
-    # Each is the pose farthest from all before.
+    usable = (np.abs(drawn - middle) <= share * half).all(axis=1) & inside(positions, rotations)
+    positions, rotations, drawn = positions[usable], rotations[usable], drawn[usable]
+    # Each is the pose farthest from all before to which a way leads.
     chosen: list[int] = []
     away = np.linalg.norm(drawn - lengths, axis=1)
+    at, last = home, lengths
     for _ in range(int(np.ceil(duration / REST_S))):
-        chosen.append(int(away.argmax()))
-        away = np.minimum(away, np.linalg.norm(drawn - drawn[chosen[-1]], axis=1))
+        farthest_first = np.argsort(-away, kind="stable").tolist()
+        ways = (k for k in farthest_first if inside.way(home, lengths, drawn[k]) and inside.way(at, last, drawn[k]))
+        if (number := next(ways, None)) is None:
+            raise InputError(
+                f"the workspace of {mechanism.name!r} has no poses to rest at within {share:g} of the strokes and within all "
+                "other limits: move home away from them, or widen them ('gough workspace' shows which is closest)"
+            )
+        chosen.append(number)
+        at, last = Pose(positions[number], rotations[number]), drawn[number]
+        away = np.minimum(away, np.linalg.norm(drawn - last, axis=1))
     return (
         REST_S * np.arange(len(chosen) + 1),
         np.concatenate([home.position[None], positions[chosen]]),
         np.concatenate([home.rotation[None], rotations[chosen]]),
     )
+
+
+class _Inside:
+    """Tells which poses are within all limits of a mechanism that home is within, with a reserve of swings and clearances."""
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        home = mechanism.require_home()
+        left = margins(mechanism, home.position[None], home.rotation[None], workers=1).values[0]
+        # A home beyond a limit is told by the check of the whole motion.
+        self._least = np.where(left >= 0.0, np.where(_WITH_RESERVE, _RESERVE * left, 0.0), -inf)
+        self._mechanism = mechanism
+
+    def __call__(self, positions: Array, rotations: Array) -> NDArray[np.bool_]:
+        """(N,): whether poses (N, ...) are inside."""
+        found: NDArray[np.bool_] = (margins(self._mechanism, positions, rotations).values >= self._least).all(axis=1)
+        return found
+
+    def way(self, start: Pose, lengths: Array, end: Array) -> bool:
+        """Whether the way from a pose, with its lengths (n,), to other lengths (n,) is inside."""
+        steps = np.linspace(lengths, end, _ON_A_WAY)
+        positions, rotations = poses_from_lengths(self._mechanism, steps, start, partial=True)
+        return bool(np.isfinite(positions).all() and self(positions, rotations).all())
 
 
 def _shortened(vectors: Array, most: float) -> Array:
@@ -140,6 +183,9 @@ def _shortened(vectors: Array, most: float) -> Array:
 def shaking(mechanism: Mechanism, duration: float, share: float = 1.0, box: Box = EVERYWHERE, back: bool = False) -> Poses:
     """Sines about home on all axes at once, about 0.8 Hz and a few percent apart, at this share of what the limits and the box
     allow; with `back` they end at home.
+
+    Raises:
+        InputError: the mechanism has no home or no limits.
     """
     limits, home = mechanism.require_limits(), mechanism.require_home()
     times = np.arange(0.0, duration + MARGIN_S + SAMPLE_PERIOD_S, SAMPLE_PERIOD_S)
@@ -157,6 +203,7 @@ def shaking(mechanism: Mechanism, duration: float, share: float = 1.0, box: Box 
         return home.position + size * shape[:, :3], turned
 
     middle, half = limits.stroke.mean(axis=1), 0.5 * (limits.stroke[:, 1] - limits.stroke[:, 0])
+    inside = _Inside(mechanism)
     low, high = 0.0, spread
     for _ in range(20):
         size = 0.5 * (low + high)
@@ -168,7 +215,7 @@ def shaking(mechanism: Mechanism, duration: float, share: float = 1.0, box: Box 
             float(np.abs(np.gradient(rates, SAMPLE_PERIOD_S, axis=0)).max()) / limits.acceleration,
             _SHAKING_SHARE * float((size * farthest / box).max()),
         )
-        low, high = (size, high) if use < _SHAKING_SHARE else (low, size)
+        low, high = (size, high) if use < _SHAKING_SHARE and inside(*at(size)).all() else (low, size)
     return times, *at(share * low)
 
 

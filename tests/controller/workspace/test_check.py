@@ -20,7 +20,7 @@ from controller.workspace import (
     margins_at,
     nearest_reachable,
 )
-from controller.workspace.limits import BEYOND, KINDS
+from controller.pose_limits.limits import BEYOND, KINDS
 from hil.command_line import main
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate

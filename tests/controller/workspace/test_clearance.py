@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import minimize, minimize_scalar
 
-from controller.workspace.clearance import disc_distance, segment_distance
+from controller.pose_limits.clearance import disc_distance, segment_distance
 
 coordinates = st.floats(-1.0, 1.0, allow_subnormal=False).map(lambda x: round(x, 6))
 points = arrays(np.float64, 3, elements=coordinates)

@@ -9,8 +9,8 @@ import pytest
 from controller.direct_kinematics import poses_from_lengths
 from controller.planning.motions import motion_from_text, text_of_motion
 from controller.planning.motions.splines import curve_at
-from controller.workspace.limits import GEOMETRY_ALONE
-from controller.workspace.margins import margins
+from controller.pose_limits.limits import GEOMETRY_ALONE
+from controller.pose_limits.margins import margins
 from hil.identification.excitation import multisine
 from plant.errors import InputError, UnreachableError
 from plant.mechanism import load_in_space

@@ -9,8 +9,8 @@ from controller.imu_set import conditionings
 from controller.inverse_kinematics import jacobian_at, legs_at
 from controller.least_squares import determinant, extreme_singular_values
 from controller.load_feed_forward import STATE, find_static_forces, own_weight
-from controller.workspace.clearance import disc_distance, segment_distance
-from controller.workspace.limits import (
+from controller.pose_limits.clearance import disc_distance, segment_distance
+from controller.pose_limits.limits import (
     BASE_PLATE,
     BASE_SWING,
     BETWEEN,
