@@ -8,7 +8,7 @@ at rest: whatever becomes of the operator or of this process, the platform stops
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import ceil, inf
+from math import ceil, inf, radians
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,7 @@ _LEAST_JOG = 1e-5
 _OUT_OF_PLANE = 1e-9
 """A planar mechanism may be asked to leave its plane by so much, which is rounding [m or rad]."""
 
-_STEP_M, _STEP_RAD, _MOST_POSES = 1e-3, np.radians(0.2), 10_000
+_STEP_M, _STEP_RAD, _MOST_POSES = 1e-3, radians(0.2), 10_000
 """Poses of a way are checked so far apart. One that is too long for so many of them leads far beyond all limits."""
 
 _OFFER_S = 0.01
@@ -434,8 +434,12 @@ def _scaled(move: Move, factor: float) -> Move:
 
 def _count(far: float, turned: float) -> int:
     """How many poses of a way are checked."""
+<<<<<<< HEAD
     count: int = ceil(min(far / _STEP_M + turned / _STEP_RAD, _MOST_POSES)) + 2
     return count
+=======
+    return ceil(min(far / _STEP_M + turned / _STEP_RAD, _MOST_POSES)) + 2
+>>>>>>> h_panelfix
 
 
 def _end_of(segments: Array) -> float:
