@@ -434,12 +434,8 @@ def _scaled(move: Move, factor: float) -> Move:
 
 def _count(far: float, turned: float) -> int:
     """How many poses of a way are checked."""
-<<<<<<< HEAD
     count: int = ceil(min(far / _STEP_M + turned / _STEP_RAD, _MOST_POSES)) + 2
     return count
-=======
-    return ceil(min(far / _STEP_M + turned / _STEP_RAD, _MOST_POSES)) + 2
->>>>>>> h_panelfix
 
 
 def _end_of(segments: Array) -> float:
