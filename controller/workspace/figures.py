@@ -7,9 +7,9 @@ import numpy as np
 from controller.imu_set import conditionings
 from controller.inverse_kinematics import sample_workspace
 from controller.load_feed_forward import first_moment_of
-from controller.workspace.extent import poses_about, reach_from, spread_points
 from controller.pose_limits.limits import GEOMETRY_ALONE, space_of
 from controller.pose_limits.margins import WORK, force_rows, margins
+from controller.workspace.extent import poses_about, reach_from, spread_points
 from plant.errors import InputError
 from plant.imu_wiring import ALL_IMUS
 from plant.mechanism import Mechanism

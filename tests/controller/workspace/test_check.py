@@ -9,6 +9,7 @@ from controller.direct_kinematics import poses_from_lengths
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.stream_planner import StreamPlanner, TargetRefusedError
 from controller.planning.target import Target, load_target
+from controller.pose_limits.limits import BEYOND, KINDS
 from controller.safety.causes import Cause
 from controller.workspace import (
     GEOMETRY_ALONE,
@@ -20,7 +21,6 @@ from controller.workspace import (
     margins_at,
     nearest_reachable,
 )
-from controller.pose_limits.limits import BEYOND, KINDS
 from hil.command_line import main
 from hil.runs.config import SimulationConfig
 from hil.runs.simulation import simulate
