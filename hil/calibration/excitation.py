@@ -1,4 +1,5 @@
-"""The motions of a calibration within limits that a user sets: how far from home, how fast, and with which force.
+"""The motions of a calibration within all limits of the mechanism, and limits that a user sets: how far from home, how fast,
+and with which force.
 
 They begin and end at home. What they are worth is known before anything moves: by ideal readings at the poses to rest at.
 """
@@ -10,12 +11,15 @@ import numpy as np
 
 from controller.calibration.at_rest import Rests, calibrate_at_rest, pose_covariance
 from controller.calibration.mounting_checks import LEAST_RATE, LEAST_SPREAD, spreads_of
+from controller.direct_kinematics import poses_from_lengths
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.motions import EVERYWHERE, REST_S, Box, Poses, rests, shaking
 from controller.planning.target import Target
 from controller.settings import sensor_settings
+from controller.workspace import LIMITS, Demands, check_against_limits, margins
 from hil.calibration.data import Knowledge, measured_lengths
 from hil.calibration.drives import within_drives
+from hil.rigs.contract import LEG_SPEED, LEG_STROKE_S
 from hil.rigs.kinematic import ideal_signals
 from plant.errors import InputError
 from plant.imu import load_imu
@@ -26,6 +30,8 @@ PROBING_S, SHAKING_S = 4.0, 40.0
 NEAR_RESTS, WIDE_RESTS = 8, 20
 _AT_REST_S, _WAY = 1.5, 1.4
 """Least time at a pose to rest at [s], and the time of the way to it over that at the limit of speed."""
+_USED = 0.9
+"""Share of the box to which the motions lead unless something else ends them."""
 _PROBING_SHARE, _PROBING_RATE = 0.3, np.radians(2.0)
 """Of the shaking, as far as some IMU turns at this rate (RMS) [rad/s]."""
 
@@ -96,20 +102,59 @@ def extent(target: Target) -> tuple[float, float]:
     return float(moved.max()), float(turned.max())
 
 
-def check_useful(mechanism: Mechanism, targets: dict[str, Target]) -> None:
+def cut_of_box(mechanism: Mechanism, targets: dict[str, Target], box: Box) -> str:
+    """To what limits of the mechanism cut the box, and which one, in words; "" if the motions lead to its edge."""
+    moved, turned = (max(each) for each in zip(*map(extent, targets.values()), strict=True))
+    if moved >= _USED * box.position and turned >= _USED * box.rotation:
+        return ""
+    found = [margins(mechanism, each.positions, each.rotations) for each in targets.values()]
+    shares = np.concatenate([each.values / each.scales for each in found]).min(axis=0)
+    return f"{1e3 * moved:.3g} mm and {np.degrees(turned):.2g} deg, mainly by the {LIMITS[int(shares.argmin())].text}"
+
+
+def check_within(mechanism: Mechanism, targets: dict[str, Target], demands: Demands) -> None:
+    """Check that the trial of the legs, and what is planned for each motion, stay within all limits of the mechanism.
+
+    Raises:
+        InputError: one does not; the message says which, where, and what to do.
+    """
+    home, tried = mechanism.require_home(), LEG_SPEED * LEG_STROKE_S
+    lengths = leg_lengths(mechanism, home.position, home.rotation) + tried * np.eye(mechanism.legs)
+    found = margins(mechanism, *poses_from_lengths(mechanism, lengths, home), demands)
+    if not found.reachable.all():
+        leg = int(found.reachable.argmin())
+        raise InputError(
+            f"home of {mechanism.name!r} is too close to a limit for the trial of leg {leg}, which extends by "
+            f"{1e3 * tried:g} mm: the {LIMITS[int(found.binding[leg])].text} does not allow it: move home away from it, "
+            "or widen it"
+        )
+    for name, target in targets.items():
+        if (excess := check_against_limits(mechanism, target, float(target.times[-1]), demands).first) is not None:
+            moved, turned = extent(target)
+            remedy = "give a smaller --box" if excess.time > 0.0 else "move home away from this limit, or widen it"
+            raise InputError(
+                f"{name}, up to {1e3 * moved:.3g} mm and {np.degrees(turned):.2g} deg from home, cannot be planned within the "
+                f"limits of {mechanism.name!r}: {excess.text}: {remedy}"
+            )
+
+
+def check_useful(mechanism: Mechanism, targets: dict[str, Target], box: Box) -> None:
     """Check that the motions move the IMUs enough for a calibration.
 
     Raises:
-        InputError: the limits are too narrow; the message says by which factor.
+        InputError: the limits are too narrow; the message says by which factor, or which limit of the mechanism it is.
     """
     for name in ("near-rests", "rests"):
         spread = float(spreads_of(_readings(mechanism, targets[name])[:, :, 3:]).max())
         if spread < 1.2 * LEAST_SPREAD:
-            raise InputError(
-                f"--box is too small: between any two poses of {name}, no IMU would turn by more than {np.degrees(spread):.2g} "
-                f"deg, and {1.2 * np.degrees(LEAST_SPREAD):.2g} are needed: make it about {1.2 * LEAST_SPREAD / spread:.2g} "
-                "times as large"
-            )
+            few = f"between any two poses of {name}, no IMU would turn by more than {np.degrees(spread):.2g} deg, and "
+            few += f"{1.2 * np.degrees(LEAST_SPREAD):.2g} are needed"
+            if cut := cut_of_box(mechanism, targets, box):
+                raise InputError(
+                    f"{mechanism.name!r} has too little room for a calibration: {few}; its limits cut the --box to {cut}: move "
+                    "home away from that limit, or widen it"
+                )
+            raise InputError(f"--box is too small: {few}: make it about {1.2 * LEAST_SPREAD / spread:.2g} times as large")
     least = min(_rate(mechanism, targets[name]) for name in ("probing", "shaking"))
     if least < 1.2 * LEAST_RATE:
         raise InputError(

@@ -16,12 +16,15 @@ import numpy as np
 from controller.calibration.at_rest import RestCalibration, pose_covariance
 from controller.calibration.file import Calibration, save_calibration
 from controller.calibration.mounting_checks import check_gravity, spreads_of
+from controller.planning.motions import EVERYWHERE
 from controller.planning.target import Target
 from hil.calibration.data import CalibrationData, Knowledge
 from hil.calibration.excitation import (
     MotionLimits,
     calibration_targets,
     check_useful,
+    check_within,
+    cut_of_box,
     expected_accuracy,
     extent,
     gentle_mechanism,
@@ -31,6 +34,7 @@ from hil.recording.mcap import read
 from hil.rigs.kinematic import ideal_signals
 from hil.runs.config import SimulationConfig
 from hil.runs.names import name_of
+from hil.runs.prepare import demands_of
 from plant.compiled import Record
 from plant.errors import CalibrationError, GoughError, InputError
 from plant.files import write_whole
@@ -73,24 +77,29 @@ class Guide(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """What the calibration will do: the configuration, whose mechanism keeps to the limits, the motions and the steps."""
+    """What the calibration will do: the configuration, whose mechanism keeps to the limits, the motions and the steps; and to
+    what limits of the mechanism cut the box that a user gave, "" if they do not.
+    """
 
     mechanism: Mechanism
     config: SimulationConfig
     targets: dict[str, Target]
     steps: tuple[Step, ...]
+    cut: str = ""
 
 
 def plan_calibration(config: SimulationConfig, limits: MotionLimits) -> Plan:
     """Plan the steps, before anything is read or moved.
 
     Raises:
-        GoughError: the mechanism cannot be used, or the limits are too narrow for a calibration.
+        GoughError: the mechanism cannot be used, the limits are too narrow for a calibration, or a motion exceeds one.
     """
     mechanism = load_spatial(config.mechanism)
     gentle = gentle_mechanism(mechanism, limits)
     targets = calibration_targets(gentle, limits.box)
-    check_useful(gentle, targets)
+    check_useful(gentle, targets, limits.box)
+    check_within(gentle, targets, demands_of(config, gentle))
+    cut = "" if limits.box == EVERYWHERE else cut_of_box(gentle, targets, limits.box)
     if gentle is not mechanism:
         config = replace(config, mechanism=name_of("mechanism", gentle))
     most = gentle.require_limits().velocity
@@ -118,7 +127,7 @@ def plan_calibration(config: SimulationConfig, limits: MotionLimits) -> Plan:
         step("rests", "The loop closes over the IMUs, with the first calibration, and the platform rests at wider poses"),
         step("shaking", "The platform shakes on all axes at once"),
     )  # fmt: skip
-    return Plan(mechanism, replace(config, raw_imus=True), targets, steps)
+    return Plan(mechanism, replace(config, raw_imus=True), targets, steps, cut)
 
 
 def lost_accuracy(plan: Plan, knowledge: Knowledge) -> str:

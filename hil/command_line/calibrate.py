@@ -168,6 +168,8 @@ def _guided(options: Namespace, config: SimulationConfig, knowledge: "Knowledge"
         box, inf if options.speed is None else 1e-3 * options.speed, inf if options.force is None else options.force
     )
     plan = plan_calibration(config, limits)
+    if plan.cut:
+        say(f"the limits of the mechanism cut --box to {plan.cut}")
     if limits != MotionLimits():
         say(lost_accuracy(plan, knowledge))
     guide = Guide(partial(_announce, simulated, not options.yes), lambda text: say(f"  {text}"))

@@ -185,7 +185,7 @@ def shaking(mechanism: Mechanism, duration: float, share: float = 1.0, box: Box 
     allow; with `back` they end at home.
 
     Raises:
-        InputError: the mechanism has no home or no limits.
+        InputError: the mechanism has no home or no limits, or its limits leave no motion.
     """
     limits, home = mechanism.require_limits(), mechanism.require_home()
     times = np.arange(0.0, duration + MARGIN_S + SAMPLE_PERIOD_S, SAMPLE_PERIOD_S)
@@ -216,6 +216,11 @@ def shaking(mechanism: Mechanism, duration: float, share: float = 1.0, box: Box 
             _SHAKING_SHARE * float((size * farthest / box).max()),
         )
         low, high = (size, high) if use < _SHAKING_SHARE and inside(*at(size)).all() else (low, size)
+    if low == 0.0:
+        raise InputError(
+            f"{mechanism.name!r} has no room to shake about home: a limit is too close there; 'gough workspace' shows which: "
+            "move home away from it, or widen it"
+        )
     return times, *at(share * low)
 
 

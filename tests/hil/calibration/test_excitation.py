@@ -77,7 +77,7 @@ def test_a_box_costs_accuracy_and_one_that_is_too_small_is_refused(hexapod: Mech
     ):
         mechanism = gentle_mechanism(hexapod, limits)
         with pytest.raises(InputError, match=message):
-            check_useful(mechanism, calibration_targets(mechanism, limits.box))
+            check_useful(mechanism, calibration_targets(mechanism, limits.box), limits.box)
     with pytest.raises(InputError, match="--speed is 0 mm/s; it must be positive"):
         MotionLimits(speed=0.0)
 
@@ -99,4 +99,4 @@ def test_what_the_motions_need_stays_below_the_force(hexapod: Mechanism) -> None
 @pytest.mark.parametrize("name", ["6-3-I", "6-5", "genhexkins"])
 def test_other_mechanisms_have_motions_too(name: str) -> None:
     mechanism = load_spatial(name)
-    check_useful(mechanism, calibration_targets(mechanism, EVERYWHERE))
+    check_useful(mechanism, calibration_targets(mechanism, EVERYWHERE), EVERYWHERE)
