@@ -109,7 +109,9 @@ def cut_of_box(mechanism: Mechanism, targets: dict[str, Target], box: Box) -> st
         return ""
     found = [margins(mechanism, each.positions, each.rotations) for each in targets.values()]
     shares = np.concatenate([each.values / each.scales for each in found]).min(axis=0)
-    return f"{1e3 * moved:.3g} mm and {np.degrees(turned):.2g} deg, mainly by the {LIMITS[int(shares.argmin())].text}"
+    return (
+        f"{1e3 * moved:.3g} mm and {np.degrees(turned):.2g} deg, mainly by the limit of the {LIMITS[int(shares.argmin())].text}"
+    )
 
 
 def check_within(mechanism: Mechanism, targets: dict[str, Target], demands: Demands) -> None:
@@ -125,8 +127,8 @@ def check_within(mechanism: Mechanism, targets: dict[str, Target], demands: Dema
         leg = int(found.reachable.argmin())
         raise InputError(
             f"home of {mechanism.name!r} is too close to a limit for the trial of leg {leg}, which extends by "
-            f"{1e3 * tried:g} mm: the {LIMITS[int(found.binding[leg])].text} does not allow it: move home away from it, "
-            "or widen it"
+            f"{1e3 * tried:g} mm: the limit of the {LIMITS[int(found.binding[leg])].text} does not allow it: move home "
+            "away from it, or widen it"
         )
     for name, target in targets.items():
         if (excess := check_against_limits(mechanism, target, float(target.times[-1]), demands).first) is not None:

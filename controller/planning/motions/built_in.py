@@ -139,7 +139,8 @@ def rests(mechanism: Mechanism, duration: float, share: float = 0.8, size: float
         if (number := next(ways, None)) is None:
             raise InputError(
                 f"the workspace of {mechanism.name!r} has no poses to rest at within {share:g} of the strokes and within all "
-                "other limits: move home away from them, or widen them ('gough workspace' shows which is closest)"
+                "other limits ('gough workspace' shows which is closest): move home away from them, widen them, or keep to a "
+                "box about home (--box of 'gough calibrate rig')"
             )
         chosen.append(number)
         at, last = Pose(positions[number], rotations[number]), drawn[number]

@@ -9,17 +9,20 @@ from controller.direct_kinematics import poses_from_lengths
 from controller.planning.motions import EVERYWHERE, Box, rests, shaking
 from controller.planning.offline_planner import plan
 from controller.planning.segments import evaluate_reference
+from controller.workspace import Demands, margins
 from hil.calibration.data import TO_50_UM, Knowledge
 from hil.calibration.drives import within_drives
 from hil.calibration.excitation import (
     MotionLimits,
     calibration_targets,
     check_useful,
+    check_within,
+    cut_of_box,
     expected_accuracy,
     gentle_mechanism,
 )
 from plant.errors import InputError
-from plant.mechanism import Mechanism, load_spatial
+from plant.mechanism import Mechanism, load_mechanism, load_spatial
 from plant.mechanism.loads import home_loads
 from plant.pose import vector_from_rotation
 
@@ -100,3 +103,62 @@ def test_what_the_motions_need_stays_below_the_force(hexapod: Mechanism) -> None
 def test_other_mechanisms_have_motions_too(name: str) -> None:
     mechanism = load_spatial(name)
     check_useful(mechanism, calibration_targets(mechanism, EVERYWHERE), EVERYWHERE)
+
+
+def swinging(swing: float, **changes: float) -> Mechanism:
+    """The preset with joints that swing by so much [rad], and legs of 30 mm."""
+    return load_mechanism(
+        "hexapod", {"joints.base_swing": swing, "joints.platform_swing": swing, "bodies.leg_diameter": 0.03} | changes
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("box", [EVERYWHERE, Box(0.05, radians(15.0))], ids=["everywhere", "box"])
+@pytest.mark.parametrize("swing", [0.3, 0.15])
+def test_what_is_planned_stays_within_swings_and_clearances(swing: float, box: Box) -> None:
+    mechanism = swinging(swing)
+    free = load_spatial("hexapod")
+    wide = calibration_targets(free, box)["rests"]
+    assert not margins(mechanism, wide.positions, wide.rotations).reachable.all(), "strokes alone do not keep within the swings"
+    targets = calibration_targets(mechanism, box)
+    check_useful(mechanism, targets, box)
+    check_within(mechanism, targets, Demands())
+    for target in targets.values():
+        positions, rotations, _ = followed(mechanism, target, float(target.times[-1]))
+        assert margins(mechanism, positions, rotations).reachable.all()
+    home = mechanism.require_home()
+    left = margins(mechanism, home.position[None], home.rotation[None]).of("platform swing")
+    resting = margins(mechanism, targets["rests"].positions, targets["rests"].rotations).of("platform swing")
+    assert resting.min() >= 0.1 * left.min(), "there is a reserve for the error of the pose"
+
+
+@pytest.mark.slow
+def test_the_limit_that_cuts_the_box_is_named() -> None:
+    box, mechanism = Box(0.05, radians(15.0)), swinging(0.15)
+    assert "mainly by the limit of the platform swing of leg" in cut_of_box(mechanism, calibration_targets(mechanism, box), box)
+    free = load_spatial("hexapod")
+    assert cut_of_box(free, calibration_targets(free, BOX), BOX) == ""
+
+
+@pytest.mark.slow
+def test_motions_beyond_a_limit_are_refused_with_the_box_as_the_remedy() -> None:
+    targets = calibration_targets(load_spatial("hexapod"), EVERYWHERE)
+    with pytest.raises(InputError, match=r"rests, up to .*platform swing of leg . would be .*: give a smaller --box"):
+        check_within(swinging(0.15), targets, Demands())
+
+
+@pytest.mark.slow
+def test_limits_that_leave_too_little_are_told_apart_from_the_box() -> None:
+    with pytest.raises(InputError, match=r"no poses to rest at within .* all other limits .*--box"):
+        calibration_targets(swinging(0.03), EVERYWHERE)
+    small, mechanism = Box(0.005, radians(1.0)), swinging(0.3)
+    with pytest.raises(InputError, match=r"--box is too small: .* make it about .* times as large"):
+        check_useful(mechanism, calibration_targets(mechanism, small), small)
+    tight = swinging(0.05)
+    with pytest.raises(InputError, match=r"has too little room .* its limits cut the --box to .* of the platform swing of leg"):
+        check_useful(tight, calibration_targets(load_spatial("hexapod"), small), EVERYWHERE)
+
+
+def test_a_home_without_room_for_the_trial_of_the_legs_is_refused() -> None:
+    with pytest.raises(InputError, match=r"too close to a limit for the trial of leg ., which extends by 2 mm: the limit of"):
+        check_within(swinging(0.002), {}, Demands())
