@@ -185,7 +185,7 @@ def test_the_plant_rehearses_it_within_a_box(tmp_path: Path, capsys) -> None:
 def test_a_mechanism_whose_joints_swing_little_is_calibrated_within_its_limits(tmp_path: Path, capsys) -> None:
     own = tmp_path / "own.toml"
     own.write_text(
-        'based_on = "hexapod"\nname = "own"\n\n[joints]\nbase_swing = 0.3\nplatform_swing = 0.3\n\n[bodies]\nleg_diameter = 0.03\n'
+        'based_on = "hexapod"\nname = "own"\n[joints]\nbase_swing = 0.3\nplatform_swing = 0.3\n[bodies]\nleg_diameter = 0.03\n'
     )
     command = ["calibrate", "rig", "--mechanism", str(own), "--imu", "mpu9150", "--seed", "3"]
     for name, options in (("whole", []), ("boxed", ["--box", "90", "20"])):
