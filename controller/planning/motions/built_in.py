@@ -164,7 +164,7 @@ class _Inside:
 
     def __call__(self, positions: Array, rotations: Array) -> NDArray[np.bool_]:
         """(N,): whether poses (N, ...) are inside."""
-        found: NDArray[np.bool_] = (margins(self._mechanism, positions, rotations).values >= self._least).all(axis=1)
+        found: NDArray[np.bool_] = np.all(margins(self._mechanism, positions, rotations).values >= self._least, axis=1)
         return found
 
     def way(self, start: Pose, lengths: Array, end: Array) -> bool:
