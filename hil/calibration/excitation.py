@@ -107,11 +107,14 @@ def cut_of_box(mechanism: Mechanism, targets: dict[str, Target], box: Box) -> st
     moved, turned = (max(each) for each in zip(*map(extent, targets.values()), strict=True))
     if moved >= _USED * box.position and turned >= _USED * box.rotation:
         return ""
-    found = [margins(mechanism, each.positions, each.rotations) for each in targets.values()]
-    shares = np.concatenate([each.values / each.scales for each in found]).min(axis=0)
-    return (
-        f"{1e3 * moved:.3g} mm and {np.degrees(turned):.2g} deg, mainly by the limit of the {LIMITS[int(shares.argmin())].text}"
-    )
+    home = mechanism.require_home()
+    positions = np.concatenate([home.position[None], *(each.positions for each in targets.values())])
+    rotations = np.concatenate([home.rotation[None], *(each.rotations for each in targets.values())])
+    at_home, *away = margins(mechanism, positions, rotations).values
+    # Of what home leaves of each limit, the part that is left.
+    shares = np.divide(np.min(away, axis=0), at_home, out=np.full(len(LIMITS), inf), where=np.isfinite(at_home))
+    closest = LIMITS[int(shares.argmin())].text
+    return f"{1e3 * moved:.3g} mm and {np.degrees(turned):.2g} deg, mainly by the limit of the {closest}"
 
 
 def check_within(mechanism: Mechanism, targets: dict[str, Target], demands: Demands) -> None:
