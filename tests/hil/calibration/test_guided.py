@@ -181,7 +181,7 @@ def test_the_plant_rehearses_it_within_a_box(tmp_path: Path, capsys) -> None:
     assert json.loads(figures.read_text())["true"]["motion"] == true
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_a_mechanism_whose_joints_swing_little_is_calibrated_within_its_limits(tmp_path: Path, capsys) -> None:
     own = tmp_path / "own.toml"
     swings = "[joints]\nbase_swing = 0.3\nplatform_swing = 0.3\n"
