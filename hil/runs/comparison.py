@@ -327,7 +327,8 @@ def _of_recording(source: str, run: RecordedRun) -> _Loaded:
     state = RunState()
     state.add(run.records)
     figures = _with_the_hold(state.errors(), state.rotation_errors())
-    events = tuple(f"cycle {cycle}: {text}" for cycle, text in run.events)
+    # Those that the JSON of a run has; a recording also tells each missed period.
+    events = tuple(state.events)
     figures["events"] = len(events)
     seconds = float(times[-1]) + run.period
     return _Loaded(source, "recording", str(run.config["version"]), _config(run.config), seconds, events, figures, run)

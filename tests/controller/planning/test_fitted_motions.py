@@ -24,7 +24,9 @@ BEFORE = {
 """Deviations of the motions of `DURATIONS`, weighted and summed, when they kept within the strokes alone."""
 
 
-@pytest.mark.parametrize("preset", BEFORE)
+@pytest.mark.parametrize(
+    "preset", ["hexapod", *(pytest.param(name, marks=pytest.mark.slow) for name in BEFORE if name != "hexapod")]
+)
 def test_the_motions_of_presets_are_what_they_were(preset: str) -> None:
     mechanism = load_in_space(preset)
     for (name, duration), before in zip(DURATIONS.items(), BEFORE[preset], strict=True):

@@ -115,7 +115,7 @@ def test_the_end_of_a_run_waits_for_no_other_order(hexapod):
     ):  # fmt: skip
         take_control(browser)
         page._live._orders.give(server.get_clients()[0], lambda operator: over.wait(30.0))
-        browser.press("Software quick stop (no emergency stop)")
+        browser.press("Software quick stop")
         waited(lambda: run.link[Link.STOP] == StopRequest.QUICK, 5.0)
         over.set()
 

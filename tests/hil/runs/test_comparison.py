@@ -165,7 +165,7 @@ def test_what_was_written_of_a_run_is_taken_as_it_is(compared, folder):
 def test_a_recording_without_a_missed_period_has_the_figures_of_its_simulation(folder):
     made = compare([folder / "long.mcap", folder / "simulated.json"])
     recorded, simulated = made.runs
-    if recorded.figures["missed_periods"]:
+    if recorded.figures["missed_periods"] or read(folder / "long.mcap").records["missed"].any():
         pytest.skip("the machine was too busy for the clock")
     for name in FIGURES:
         if name.startswith(("estimation", "tracking", "protection")):
@@ -328,6 +328,7 @@ def test_the_report_has_the_table_and_the_recordings_on_top_of_each_other(comman
 
 
 @NEEDS_PLOTLY
+@pytest.mark.slow
 def test_a_browser_draws_the_report_without_an_error(commanded):
     draw_in_browser(commanded[1] / "report.html", 4)
 

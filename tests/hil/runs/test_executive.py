@@ -820,7 +820,7 @@ def test_what_a_calibration_does_not_tell_is_said_before_the_run_and_recorded(tm
     path.write_text("[imu_2.accelerometer]\nbias = [1e-4, 0.0, 0.0]\n")
     said = []
     summary = run(
-        SimulationConfig(target="hold", duration=0.2, calibration=str(path)), SETTINGS, tmp_path / "run.mcap",
+        SimulationConfig(target="hold", duration=0.2, calibration=str(path), channel="none"), SETTINGS, tmp_path / "run.mcap",
         say=said.append,
     )  # fmt: skip
     assert len(said) == 1 and said[0].startswith(f"{path} has no digest")

@@ -460,7 +460,7 @@ def test_errors_of_a_sensor_are_checked(errors: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("seed", [-1, 2**63])
 def test_a_seed_out_of_range_is_refused(seed: int) -> None:
-    with pytest.raises(InputError, match=f"the seed is {seed}; it must lie between 0 and"):
+    with pytest.raises(InputError, match=f"the seed is {seed}; it must be a whole number between 0 and"):
         imu_state(ImuModel("any"), seed, PERIOD)
 
 
