@@ -64,8 +64,8 @@ def state_of(control):
 
 
 def started(at, control, *options, rig="udp"):
-    """A run whose drives follow, and move."""
-    process = gough("run", "--rig", rig, "--rig-at", at, *MOTION, *PATIENT, "--duration", 60, *options)
+    """A run whose drives follow, and move; without a channel its loop is the first process that it starts."""
+    process = gough("run", "--rig", rig, "--rig-at", at, "--channel", "none", *MOTION, *PATIENT, "--duration", 60, *options)
     wait_for(lambda: process.poll() is not None or moves(state_of(control)))
     assert process.poll() is None, process.communicate()
     return process
