@@ -216,7 +216,7 @@ def simulate(
             _check_time(save_at, loop, first)
         snapshot = None
         cause, took = Cause.NONE.value, loop.planning_time
-        done, chunk = first, 1
+        done, chunk, share = first, 1, 0.0
         while cause == Cause.NONE and done < loop.cycle_at(config.duration):
             saved = None if save_at is None else loop.cycle_at(save_at)
             last = min(done + chunk, saved if saved is not None and done < saved else loop.cycle_at(config.duration))
@@ -228,7 +228,9 @@ def simulate(
             chunk = max(1, min(2 * chunk, int(chunk * _CHUNK_S / max(passed, 1e-6))))
             if cause == Cause.NONE and save_at is not None and last == loop.cycle_at(save_at) and stop["cause"] == Cause.NONE:
                 snapshot = take_snapshot(asdict(config), loop)
-            progress(min((done - first) / (loop.cycle_at(config.duration) - first), 1.0))
+            # A motion that waits for the pose ends later than planned: the share stands still then.
+            share = max(share, min((done - first) / (loop.cycle_at(config.duration) - first), 1.0))
+            progress(share)
         result = _result(config, loop, first, snapshot, took, stages)
         if stop["cause"] != Cause.NONE:
             raise _stopped(loop, result, cause) from loop.error
