@@ -15,6 +15,7 @@ from hil.panel.margins import MARGINS_S, MarginTable
 from hil.panel.orders import Orders
 from hil.panel.readings import Readings, event_list
 from hil.panel.scene import Machine, Scene
+from hil.realtime.scheduling import processor_left
 from hil.runs.operator import Operator, RequestRefusedError
 from hil.runs.operator_messages import RUN_ENDED, ChannelError
 
@@ -66,6 +67,12 @@ class LivePanel:
 
     def run(self, over: threading.Event) -> str:
         """Show the run until it ends or `over` is set; the picture of its last state stays. Returns how it ended, in words."""
+        with processor_left(self._run.get("processor")):
+            self._show_until(over)
+        events = event_list([event for event in self._events if event != RUN_ENDED])
+        return f"{self._status.content}\n\n**The run has ended.**\n\n{events}\n\n"
+
+    def _show_until(self, over: threading.Event) -> None:
         running = True
         while running and not over.is_set():
             try:
@@ -77,8 +84,6 @@ class LivePanel:
             self._take_events()
             if self._watching.telemetry:
                 self._show(self._watching.telemetry, last=not running)
-        events = event_list([event for event in self._events if event != RUN_ENDED])
-        return f"{self._status.content}\n\n**The run has ended.**\n\n{events}\n\n"
 
     def close(self) -> None:
         """Leave the run."""

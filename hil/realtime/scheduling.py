@@ -60,6 +60,11 @@ class RealTimeSettings:
         """The processor to stay on."""
         return max(os.sched_getaffinity(0)) if self.cpu is None else self.cpu
 
+    @property
+    def kept_processor(self) -> int | None:
+        """The processor that others leave to the loop; None if it stays on none."""
+        return None if "processor" in self.without else self.processor
+
 
 class RefusedError(GoughError, PermissionError):
     """The machine refuses a measure, and the settings are strict."""
@@ -95,6 +100,27 @@ def real_time(settings: RealTimeSettings) -> Iterator[list[str]]:
         if refused and settings.strict:
             raise RefusedError(f"this machine refuses {'; '.join(refused)}; or run without --strict")
         yield refused
+
+
+@contextmanager
+def processor_left(cpu: int | None) -> Iterator[None]:
+    """Leave a processor to a loop while the context lasts, if there is another: all threads of this process stay away from it,
+    and so do the threads and processes that they start. None leaves none.
+    """
+    before: dict[int, set[int]] = {}
+    for thread in [int(each.name) for each in Path("/proc/self/task").iterdir()] if cpu is not None else []:
+        # A thread may have ended.
+        with suppress(OSError):
+            allowed = os.sched_getaffinity(thread)
+            if cpu in allowed and len(allowed) > 1:
+                os.sched_setaffinity(thread, allowed - {cpu})
+                before[thread] = allowed
+    try:
+        yield
+    finally:
+        for thread, allowed in before.items():
+            with suppress(OSError):
+                os.sched_setaffinity(thread, allowed)
 
 
 def come_before_others() -> None:

@@ -47,8 +47,9 @@ def open_channel(host: str, port: int) -> socket.socket:
 
 @contextmanager
 def channel_process(
-    config: SimulationConfig, records: Record, link: NDArray[np.int64], stream: Record | None, say: Say
-) -> Iterator[BaseProcess | None]:
+    config: SimulationConfig, records: Record, link: NDArray[np.int64], stream: Record | None, say: Say,
+    processor: int | None = None,
+) -> Iterator[BaseProcess | None]:  # fmt: skip
     """The process of a run's channel while the context lasts; None if it has no channel.
 
     Args:
@@ -56,6 +57,7 @@ def channel_process(
         records, link: shared with the loop.
         stream: dtype `STREAM`, shared with the loop; needed where an operator moves the platform.
         say: is told if the usual address is not free.
+        processor: that the loop keeps, and clients on this machine are asked to leave to it; None if it keeps none.
 
     Raises:
         GoughError: an address that was asked for, the token or the points cannot be used.
@@ -71,7 +73,8 @@ def channel_process(
         frames = config.active_frames or ActiveFrames(Frames())
         workplace = Workplace(mechanism, frames, demands_of(config, mechanism), points)
         operated = stream if config.operated else None
-        process = started(_serve, listener, token, workplace, config.target, 1.0 / config.rate, records, link, operated)
+        period = 1.0 / config.rate
+        process = started(_serve, listener, token, workplace, config.target, processor, period, records, link, operated)
     try:
         yield process
     finally:

@@ -40,7 +40,7 @@ from hil.loop.stage_times import over_budget
 from hil.progress import Say, say_nothing
 from hil.realtime.clock import REAL, new_clock
 from hil.realtime.processes import FORK, PATIENCE_S, join_or_kill, signals_handled, started
-from hil.realtime.scheduling import RealTimeSettings, real_time, since_process_start, usage
+from hil.realtime.scheduling import RealTimeSettings, processor_left, real_time, since_process_start, usage
 from hil.rigs import Rig
 from hil.rigs.udp.link import parse_address
 from hil.rigs.udp.rig import UdpRig
@@ -111,11 +111,12 @@ def run(
     link: NDArray[np.int64] = shared_array(LINK_SIZE, np.dtype(np.int64))
     link[Link.SUPERVISOR] = os.getpid()
     state = RunState(frames=config.active_frames)
-    with _asked_to_stop(link), claimed(recording), contextlib.ExitStack() as at_end:
+    allowed, kept = os.sched_getaffinity(0), settings.kept_processor
+    with _asked_to_stop(link), claimed(recording), processor_left(kept), contextlib.ExitStack() as at_end:
         stream: Record | None = shared_array(1, STREAM).reshape(()) if config.streamed else None
         # Forked before there is a pipe, which they would keep open.
         remarks: list[str] = []
-        channel = at_end.enter_context(channel_process(config, records, link, stream, remarks.append))
+        channel = at_end.enter_context(channel_process(config, records, link, stream, remarks.append, kept))
         planner: BaseProcess | None = None
         if stream is not None:
             planner = channel if config.operated else at_end.enter_context(_receiver(config, stream))
@@ -123,7 +124,7 @@ def run(
         recorders = Recorders(recording, records, link, ours, state.events)
         at_end.enter_context(_reported(state, recorders))
         at_end.callback(recorders.finish)
-        loop = started(_loop_process, theirs, ours, link, config, settings, rig, records, stream, stages)
+        loop = started(_loop_process, allowed, theirs, ours, link, config, settings, rig, records, stream, stages)
         theirs.close()
         leftovers: list[Path | None] = []
         at_end.callback(_end, loop, link, leftovers)
@@ -240,7 +241,10 @@ def _end(loop: BaseProcess, link: NDArray[np.int64], leftovers: list[Path | None
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _loop_process(pipe: Connection, supervisors: Connection, link: NDArray[np.int64], *what: Any) -> None:
+def _loop_process(
+    allowed: set[int], pipe: Connection, supervisors: Connection, link: NDArray[np.int64], *what: Any
+) -> None:  # fmt: skip
+    os.sched_setaffinity(0, allowed)
     # With this end open here, the loop would not see the supervisor's death.
     supervisors.close()
     # Without a supervisor, nobody reads the pipe.

@@ -46,7 +46,8 @@ class Operator:
         patience: how long an answer may take [s].
 
     Attributes:
-        run: what the run says of itself: `mechanism`, `frames`, `points`, `home`, usual speeds, `deadman` [s].
+        run: what the run says of itself: `mechanism`, `frames`, `points`, `home`, usual speeds, `deadman` [s]; and to
+            clients on its own machine the `processor` that its loop keeps, which they should leave to it.
         telemetry: what came last after `watch`; {} before.
         events: that came after `watch`, each a mapping with `event` and perhaps `cycle`.
 

@@ -83,6 +83,7 @@ def serve_channel(
     token: str | None,
     workplace: Workplace,
     target: str,
+    processor: int | None,
     period: float,
     records: Record,
     link: NDArray[np.int64],
@@ -95,6 +96,7 @@ def serve_channel(
         token: that each client must give; None if none is needed.
         workplace: the machine, its frames and its points.
         target: what the run follows.
+        processor: that the loop keeps; None if it keeps none.
         period: of a cycle [s].
         records, link: shared with the loop.
         stream: dtype `STREAM`, shared with the loop, where an operator moves the platform.
@@ -103,7 +105,7 @@ def serve_channel(
     if stream is not None:
         platform = OperatedPlatform(stream, workplace, period)
         come_before_others()
-    asyncio.run(_Channel(platform, workplace, target, token, period, records, link).run(listener))
+    asyncio.run(_Channel(platform, workplace, target, processor, token, period, records, link).run(listener))
 
 
 @dataclass(eq=False)
@@ -122,10 +124,11 @@ class _Client:
 
 class _Channel:
     def __init__(
-        self, platform: OperatedPlatform | None, workplace: Workplace, target: str, token: str | None, period: float,
-        records: Record, link: NDArray[np.int64],
+        self, platform: OperatedPlatform | None, workplace: Workplace, target: str, processor: int | None, token: str | None,
+        period: float, records: Record, link: NDArray[np.int64],
     ) -> None:  # fmt: skip
         self._platform, self._place, self._target, self._token, self._period = platform, workplace, target, token, period
+        self._processor = processor
         self._records, self._link, self._seen = records, link, 0
         self._latest: Any = None
         self._timed = 0
@@ -170,7 +173,7 @@ class _Channel:
         try:
             client = await self._greeted(reader, writer)
             if client is not None:
-                writer.write(encode({"gough": VERSION, "ok": True, **self._described()}))
+                writer.write(encode({"gough": VERSION, "ok": True, **self._described(writer)}))
                 await writer.drain()
                 while line := await _line(reader):
                     writer.write(encode(self._answer(client, line)))
@@ -238,8 +241,10 @@ class _Channel:
             return "busy", f"{len(others)} observers watch this run, and no more may: close one of them"
         return "", ""
 
-    def _described(self) -> dict[str, Any]:
+    def _described(self, writer: asyncio.StreamWriter) -> dict[str, Any]:
+        peer, here = (writer.get_extra_info(name)[0] for name in ("peername", "sockname"))
         return {
+            "processor": self._processor if peer == here else None,
             "operated": self._platform is not None,
             "target": self._target,
             "mechanism": self._place.mechanism.name,

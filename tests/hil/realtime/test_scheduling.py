@@ -3,6 +3,8 @@
 import gc
 import os
 import signal
+import subprocess
+import threading
 import time
 
 import pytest
@@ -13,6 +15,7 @@ from hil.realtime.scheduling import (
     RealTimeSettings,
     Usage,
     keep_to_one_thread,
+    processor_left,
     processor_time,
     real_time,
     since_process_start,
@@ -40,6 +43,24 @@ def test_the_processor_is_the_last_that_there_is_or_the_one_that_is_asked_for(mo
     assert RealTimeSettings(cpu=2).processor == 2
     with pytest.raises(InputError, match="there is no processor 3 for this process; there are 2, 5, 7"):
         RealTimeSettings(cpu=3)
+
+
+def test_a_processor_is_left_to_the_loop_by_all_threads_and_what_they_start_and_only_for_a_while():
+    before = os.sched_getaffinity(0)
+    kept, begin, over = max(before), threading.Event(), threading.Event()
+    thread = threading.Thread(target=lambda: begin.set() or over.wait())
+    thread.start()
+    begin.wait()
+    try:
+        for cpu, expected in ((kept, before - {kept} or before), (None, before), (max(before) + 1, before)):
+            with processor_left(cpu):
+                started = subprocess.run(["nproc"], stdout=subprocess.PIPE, check=True, env={"PATH": os.environ["PATH"]})
+                assert int(started.stdout) == len(expected)
+                assert os.sched_getaffinity(0) == os.sched_getaffinity(thread.native_id) == expected
+            assert os.sched_getaffinity(0) == os.sched_getaffinity(thread.native_id) == before
+    finally:
+        over.set()
+        thread.join()
 
 
 def test_nothing_is_collected_on_the_clock_and_again_afterwards():

@@ -433,7 +433,10 @@ def test_the_loop_is_alone_in_its_process_with_what_it_was_granted(tmp_path):
         assert "Threads:\t1\n" in status
         assert os.sched_getscheduler(loop) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
         assert os.sched_getparam(loop).sched_priority == 71
-        assert len(os.sched_getaffinity(loop)) == 1
+        everywhere, kept = os.sched_getaffinity(0), os.sched_getaffinity(loop)
+        assert len(kept) == 1
+        for beside in (process.pid, *(each for each in children(process.pid) if each != loop)):
+            assert os.sched_getaffinity(beside) == (everywhere - kept or everywhere)
         assert "VmLck:\t       0 kB" not in status
         maps = Path(f"/proc/{loop}/maps").read_text()
         for absent in ("casadi", "matplotlib", "ruckig_plot"):
