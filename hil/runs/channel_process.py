@@ -73,8 +73,8 @@ def channel_process(
         frames = config.active_frames or ActiveFrames(Frames())
         workplace = Workplace(mechanism, frames, demands_of(config, mechanism), points)
         operated = stream if config.operated else None
-        period = 1.0 / config.rate
-        process = started(_serve, listener, token, workplace, config.target, processor, period, records, link, operated)
+        what = listener, token, workplace, config.target, 1.0 / config.rate, records, link, operated, processor
+        process = started(_serve, *what)
     try:
         yield process
     finally:

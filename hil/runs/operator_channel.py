@@ -83,11 +83,11 @@ def serve_channel(
     token: str | None,
     workplace: Workplace,
     target: str,
-    processor: int | None,
     period: float,
     records: Record,
     link: NDArray[np.int64],
     stream: Record | None = None,
+    processor: int | None = None,
 ) -> None:
     """Serve clients until the run is done or the parent process has ended; the body of a process.
 
@@ -96,16 +96,16 @@ def serve_channel(
         token: that each client must give; None if none is needed.
         workplace: the machine, its frames and its points.
         target: what the run follows.
-        processor: that the loop keeps; None if it keeps none.
         period: of a cycle [s].
         records, link: shared with the loop.
         stream: dtype `STREAM`, shared with the loop, where an operator moves the platform.
+        processor: that the loop keeps; None if it keeps none.
     """
     platform = None
     if stream is not None:
         platform = OperatedPlatform(stream, workplace, period)
         come_before_others()
-    asyncio.run(_Channel(platform, workplace, target, processor, token, period, records, link).run(listener))
+    asyncio.run(_Channel(platform, workplace, target, token, period, records, link, processor).run(listener))
 
 
 @dataclass(eq=False)
@@ -124,8 +124,8 @@ class _Client:
 
 class _Channel:
     def __init__(
-        self, platform: OperatedPlatform | None, workplace: Workplace, target: str, processor: int | None, token: str | None,
-        period: float, records: Record, link: NDArray[np.int64],
+        self, platform: OperatedPlatform | None, workplace: Workplace, target: str, token: str | None, period: float,
+        records: Record, link: NDArray[np.int64], processor: int | None = None,
     ) -> None:  # fmt: skip
         self._platform, self._place, self._target, self._token, self._period = platform, workplace, target, token, period
         self._processor = processor
