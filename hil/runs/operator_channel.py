@@ -242,7 +242,8 @@ class _Channel:
         return "", ""
 
     def _described(self, writer: asyncio.StreamWriter) -> dict[str, Any]:
-        peer, here = (writer.get_extra_info(name)[0] for name in ("peername", "sockname"))
+        # None for who has gone already.
+        peer, here = ((writer.get_extra_info(name) or [name])[0] for name in ("peername", "sockname"))
         return {
             "processor": self._processor if peer == here else None,
             "operated": self._platform is not None,

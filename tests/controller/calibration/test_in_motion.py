@@ -57,7 +57,7 @@ def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
     assert error[6].max() < 2e-3
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_encoders_tell_more_than_a_longer_motion_without(hexapod):
     """With zeros that are centimetres off, and some readings lost."""
     readings, _, _ = rests_of(hexapod, 20, 1)
@@ -79,7 +79,7 @@ def test_encoders_tell_more_than_a_longer_motion_without(hexapod):
     assert errors[0] < 0.8 * errors[1] and 0.3 < errors[0] / predicted[0] < 2.5
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
     built, fusion = hexapod.built(2e-4, 3), sensor_settings(hexapod, RAW)
     readings, _, _ = rests_of(built, 20, 1)

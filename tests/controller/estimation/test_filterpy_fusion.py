@@ -59,7 +59,7 @@ class Twins:
 
 @pytest.mark.parametrize(
     ("rate", "seed"),
-    [(1000.0, 0), *(pytest.param(rate, seed, marks=pytest.mark.slow) for rate, seed in ((1000.0, 1), (250.0, 2), (4000.0, 3)))],
+    [(250.0, 2), *(pytest.param(rate, seed, marks=pytest.mark.slow) for rate, seed in ((1000.0, 1), (4000.0, 3)))],
 )
 def test_five_thousand_steps_agree_with_the_compiled_filter(rate, seed):
     random = np.random.default_rng(seed)

@@ -263,7 +263,7 @@ def test_no_manoeuvre_leaves_a_limit(tmp_path_factory, data):
 
 
 @pytest.mark.slow
-@settings(max_examples=30)
+@settings(max_examples=20)
 @given(st.data())
 def test_none_of_many_manoeuvres_leaves_a_limit(tmp_path_factory, data):
     check_plan(tmp_path_factory.mktemp("cue"), data)
@@ -304,7 +304,7 @@ def test_a_streamed_cue_is_never_refused_and_no_limit_is_left(data):
 
 
 @pytest.mark.slow
-@settings(max_examples=10)
+@settings(max_examples=5)
 @given(st.data())
 def test_none_of_many_streamed_cues_is_refused(data):
     check_stream(data)

@@ -494,7 +494,7 @@ def waves(times):
     return np.sin(np.pi * times)[:, None] * np.array([10e-3, 5e-3, 5e-3])
 
 
-@pytest.mark.parametrize("seed", [31, pytest.param(32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [pytest.param(31, marks=pytest.mark.slow), pytest.param(32, marks=pytest.mark.endurance)])
 @pytest.mark.parametrize(
     ("times", "made", "most"),
     [

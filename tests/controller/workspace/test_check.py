@@ -41,7 +41,7 @@ def way(mechanism, move, turn=(0.0, 0.0, 0.0), lasts=4.0, samples=81):
 
 
 @pytest.mark.parametrize("name", ["hexapod", "6-3-II", "planar-3rpr"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1, pytest.param(2, marks=pytest.mark.slow)])
 def test_the_first_violation_is_that_of_a_slow_twin(name, seed):
     """On ways to random poses, looked at each 0.1 ms; the worst is at their end, or inside."""
     mechanism, random = limited(name), np.random.default_rng(seed)
@@ -118,6 +118,7 @@ def test_the_nearest_pose_is_reachable_and_none_near_it_is_nearer(name):
     assert tried >= 6
 
 
+@pytest.mark.slow
 def test_a_pose_a_metre_away_has_a_nearest_one(hexapod):
     asked = Pose(hexapod.home.position + [1.0, 0.0, 0.0], hexapod.home.rotation)
     found = nearest_reachable(hexapod, asked)

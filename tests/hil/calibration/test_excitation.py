@@ -66,7 +66,7 @@ def test_without_limits_the_motions_are_the_named_ones(hexapod: Mechanism) -> No
     np.testing.assert_allclose(back[1][middle], positions[middle], atol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_a_box_costs_accuracy_and_one_that_is_too_small_is_refused(hexapod: Mechanism) -> None:
     within, best = (
         expected_accuracy(hexapod, calibration_targets(hexapod, box)["rests"], Knowledge()) for box in (BOX, EVERYWHERE)

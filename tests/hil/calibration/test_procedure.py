@@ -90,6 +90,7 @@ def test_what_it_says_of_itself_without_the_truth_is_honest(calibrated):
 
 
 @pytest.mark.endurance
+@pytest.mark.endurance
 def test_recordings_tell_the_same_and_known_poses_less(recorded):
     files = [recorded / "shaking.mcap", recorded / "rests.mcap"]
     summary = calibrate_recordings(files).summary

@@ -33,7 +33,9 @@ ENCODERS = with_encoders(CASES, "incremental")
 @pytest.mark.parametrize(
     "case",
     [
-        each if each.name == "a leg's IMU is biased by 2 deg" else pytest.param(each, marks=pytest.mark.slow)
+        each
+        if each.name == "a leg's IMU is biased by 2 deg"
+        else pytest.param(each, marks=pytest.mark.endurance if "stream" in each.name else pytest.mark.slow)
         for each in ENCODERS
     ],
     ids=[each.name for each in ENCODERS],

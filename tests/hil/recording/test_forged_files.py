@@ -186,7 +186,7 @@ print(tried)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_no_value_of_any_parameter_ends_the_process(parameters, tmp_path):
     np.save(tmp_path / "parameters.npy", parameters)
     command = [sys.executable, "-c", _TRY_ALL, str(tmp_path / "parameters.npy"), str(tmp_path / "run.mcap")]

@@ -72,6 +72,7 @@ def test_the_report_draws_the_errors_and_both_modes(report, result):
         assert np.linalg.norm(other[1] - nearest[1]) > 10.0
 
 
+@pytest.mark.slow
 def test_a_browser_draws_the_report_without_an_error(report):
     draw_in_browser(report, 2)
 

@@ -77,6 +77,7 @@ def test_a_dozen_factors_are_drawn(sampled, tmp_path):
     draw_in_browser(path, 7)
 
 
+@pytest.mark.slow
 def test_one_factor_is_enough_and_all_runs_may_fail(tmp_path):
     one = made(tmp_path / "one", lambda x: 2.0 * x, Factor("x", (1.0, 2.0)))
     path, page = written(one, tmp_path)

@@ -36,7 +36,9 @@ def design_of(name, count):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "count"), [("hexapod", 4), ("planar-3rpr", 3), ("hexapod", 0)])
+@pytest.mark.parametrize(
+    ("name", "count"), [pytest.param("hexapod", 4, marks=pytest.mark.slow), ("planar-3rpr", 3), ("hexapod", 0)]
+)
 def test_every_figure_is_there(name, count, tmp_path, recwarn):
     design = design_of(name, count)
     path = tmp_path / "page" / "report.html"

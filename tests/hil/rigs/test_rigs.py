@@ -536,6 +536,7 @@ def test_a_replay_on_the_clock(recorded, tmp_path):
         assert again[name][:upto].tobytes() == records[name][:upto].tobytes(), name
 
 
+@pytest.mark.slow
 def test_the_end_of_the_recording_ends_the_run(recorded, tmp_path):
     path, records = recorded
     cause, again = replayed(path, duration=0.5, arm=False)
@@ -595,6 +596,7 @@ def test_missed_periods_and_consecutive_files(recorded, tmp_path):
 # ------------------------------------------------------------------------------------------------------- rigs of one's own
 
 
+@pytest.mark.slow
 def test_the_template_runs_on_the_clock():
     config = SimulationConfig(target="sines", duration=1.0, rate=200.0, imu="ideal", rig="python:hil.rigs.template:TemplateRig")
     summary = run(config, SETTINGS)

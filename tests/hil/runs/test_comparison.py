@@ -30,6 +30,7 @@ SETTINGS = RealTimeSettings(most_missed=2000)
 LONG = SimulationConfig(target="sines", duration=1.0, rate=250.0)
 SHORT = SimulationConfig(target="circle", duration=0.6, rate=500.0, imu="ideal", seed=2, fusion="whole")
 PLANE = SimulationConfig(mechanism="planar-3rpr", duration=0.5, rate=250.0)
+pytestmark = pytest.mark.slow
 NEEDS_PLOTLY = pytest.mark.skipif(find_spec("plotly") is None, reason="needs plotly")
 
 

@@ -341,6 +341,7 @@ def test_when_the_supervisor_is_killed_the_loop_stops_by_itself_and_the_file_is_
     assert replay([path]).same
 
 
+@pytest.mark.slow
 def test_when_the_loop_is_killed_its_file_is_complete_and_the_run_fails(tmp_path):
     path = tmp_path / "run.mcap"
     process, loop, recorder = started(path, env={**os.environ, "TMPDIR": str(tmp_path)})
@@ -388,7 +389,11 @@ def replaced(path):
 
 
 @pytest.mark.parametrize(
-    "spoil", [deleted, pytest.param(cut, marks=pytest.mark.slow), pytest.param(replaced, marks=pytest.mark.slow)]
+    "spoil",
+    [
+        pytest.param(deleted, marks=pytest.mark.slow),
+        *(pytest.param(each, marks=pytest.mark.endurance) for each in (cut, replaced)),
+    ],
 )
 def test_a_recording_that_is_spoiled_while_it_goes_on_is_noticed_and_the_rest_is_kept(tmp_path, spoil):
     path, second, figures = tmp_path / "run.mcap", tmp_path / "run-2.mcap", tmp_path / "run.json"
@@ -744,6 +749,7 @@ class Raising(FmuRig):
         super().quick_stop()
 
 
+@pytest.mark.slow
 def test_a_rig_that_raises_is_braked(tmp_path):
     Raising.mark = tmp_path / "braked"
     with pytest.raises(RunStoppedError, match="ValueError: the bus is gone"):
@@ -818,6 +824,7 @@ def test_a_terminal_shows_the_run_as_it_goes():
         assert text in shown
 
 
+@pytest.mark.slow
 def test_what_a_calibration_does_not_tell_is_said_before_the_run_and_recorded(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("[imu_2.accelerometer]\nbias = [1e-4, 0.0, 0.0]\n")

@@ -137,6 +137,7 @@ def test_a_warning_and_every_flag_of_fmi_3_end_a_simulation(foreign_fmu_3, bindi
         simulate(config)
 
 
+@pytest.mark.slow
 def test_a_run_on_the_clock_ends_with_the_message_of_the_fmu(foreign_fmu, bare):
     # Changed while it runs: the fault is due 0.2 s after the hold of 0.2 s.
     faults = ("--set", "fault.status=3", "--set", "fault.at=0.001@0.2")

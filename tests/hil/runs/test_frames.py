@@ -239,6 +239,7 @@ def test_a_stream_has_poses_of_the_tool_in_the_work_frame(cell):
     np.testing.assert_allclose(planned.goal, raised, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_run_on_the_clock_records_its_frames_and_says_how_far_the_tool_is_off(cell, tmp_path):
     path = tmp_path / "run.mcap"
     summary = run(replace(cell, duration=0.5, rate=200.0), RealTimeSettings(), path)

@@ -292,7 +292,7 @@ def test_a_rig_that_is_not_there_or_stands_elsewhere_is_not_driven():
     [
         pytest.param((), "the target's stream has stopped", marks=pytest.mark.slow),
         pytest.param(("--jump-at", 2), "the target", marks=pytest.mark.slow),
-        pytest.param(("--nan-at", 2), "the target is not finite", marks=pytest.mark.slow),
+        pytest.param(("--nan-at", 2), "the target is not finite", marks=pytest.mark.endurance),
     ],
 )
 def test_a_streamed_target_is_followed_until_it_goes_wrong(tmp_path, options, words):

@@ -122,7 +122,7 @@ def test_a_run_over_which_workers_died_is_tried_at_the_next_start_too(folder: Pa
     assert set(ran(folder)) == {"12"}
 
 
-@pytest.mark.slow(seconds=35)
+@pytest.mark.endurance
 def test_a_worker_that_dies_costs_its_batch(folder: Path) -> None:
     with started(gough_sweep("runs.toml", "--workers", 2), folder) as process:
         wait_until(lambda: ran(folder).total() > 36, "half of the runs are done")

@@ -326,7 +326,7 @@ def test_the_volume_of_the_true_front_is_the_known_one():
     assert volume(list(zip(first, 1.0 - np.sqrt(first), strict=True))) == pytest.approx(ZDT1_VOLUME, rel=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_a_process_that_is_killed_loses_nothing(tmp_path):
     design = zdt1(tmp_path, 200, 1)
     slow = ZDT1.replace("    first, *others", '    time.sleep(0.01)\n    open("calls", "a").write("x\\n")\n    first, *others')

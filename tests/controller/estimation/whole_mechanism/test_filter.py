@@ -396,7 +396,8 @@ def test_taken_bit_by_bit_it_equals_its_dense_twin(hexapod, errors, rig, base, t
     ("errors", "rig"),
     [
         ("gyroscopes", False),
-        *(pytest.param("axes", rig, marks=pytest.mark.slow) for rig in (False, True)),
+        pytest.param("axes", False, marks=pytest.mark.endurance),
+        pytest.param("axes", True, marks=pytest.mark.slow),
     ],
 )
 def test_with_encoders_it_equals_its_twin_whose_states_are_their_readings(hexapod, errors, rig):
