@@ -33,10 +33,10 @@ test: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "not slow and not endurance"
 
 test-all: test
-	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "slow or hypothesis" --hypothesis-profile=all --durations=25
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "slow and not endurance" --hypothesis-profile=all --durations=25
 
 test-endurance: .venv/installed-test
-	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m endurance
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "endurance or hypothesis" --hypothesis-profile=all
 
 bench: bench-loop bench-fusion bench-faults
 
