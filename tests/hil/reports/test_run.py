@@ -211,7 +211,7 @@ def test_a_file_that_cannot_be_written_is_refused(result, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("width", [320, pytest.param(420, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("width", [320, pytest.param(420, marks=pytest.mark.endurance)])
 def test_in_a_narrow_window_nothing_is_beyond_its_edge(report, width):
     takes, has = widths_in_browser(report, width)
     assert takes <= has <= width

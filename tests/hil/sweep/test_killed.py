@@ -109,7 +109,7 @@ def test_a_sweep_goes_on_after_a_worker_and_the_program_died(folder: Path) -> No
     assert max(later.values()) <= 3
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_a_run_over_which_workers_died_is_tried_at_the_next_start_too(folder: Path) -> None:
     command = gough_sweep("deadly.toml", "--workers", 2)
     for starts in (1, 2):
