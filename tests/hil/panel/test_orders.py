@@ -107,6 +107,16 @@ def test_any_browser_ends_the_run_at_once_though_another_program_operates_it(hex
         assert len(browser.notices) == 1
 
 
+def test_a_panel_leaves_the_processor_of_the_loop_to_it_until_the_run_has_ended(hexapod):
+    everywhere = os.sched_getaffinity(0)
+    kept = max(everywhere)
+    with running(hexapod, processor=kept) as run, served(run.address) as (_, page, _), shown(page):
+        waited(lambda: os.sched_getaffinity(0) == (everywhere - {kept} or everywhere) and page._live is not None)
+        run.link[Link.DONE] = 1
+        waited(lambda: page._live is None)
+        assert os.sched_getaffinity(0) == everywhere
+
+
 def test_the_end_of_a_run_waits_for_no_other_order(hexapod):
     over = threading.Event()
     with (

@@ -35,7 +35,7 @@ class Beside:
 
     @contextmanager
     def served(self):
-        with channel_process(self.config, self.records, self.link, None, self.said.append) as self.process:
+        with channel_process(self.config, self.records, self.link, None, self.said.append, 3) as self.process:
             yield self
 
 
@@ -61,6 +61,16 @@ def test_all_may_watch_and_end_the_run_but_nobody_may_move_it():
         with pytest.raises(ChannelError, match="the run has ended"):
             observer.listen(5.0)
         assert observer.events[-1]["event"] == "the run has ended"
+
+
+def test_clients_on_its_machine_are_told_which_processor_the_loop_keeps(tmp_path):
+    (tmp_path / "token").write_text(TOKEN)
+    port = free_port()
+    with Beside(channel=f"0.0.0.0:{port}", token_file=str(tmp_path / "token")).served():
+        for address, processor in (("127.0.0.1", 3), ("127.0.0.2", None)):
+            # The second comes from 127.0.0.1, as one from another machine has another address than the run.
+            with Operator(f"{address}:{port}", TOKEN, role="observer") as observer:
+                assert observer.run["processor"] == processor
 
 
 def test_a_run_that_ends_while_clients_are_there_prints_nothing(capfd):

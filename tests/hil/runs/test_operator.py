@@ -72,7 +72,7 @@ def looped(stream, lengths, references, shared):
 class Run:
     """A run that is operated: its processes, and what the loop was told."""
 
-    def __init__(self, mechanism, token=None, points=None, frames=None, stop_cause=None):
+    def __init__(self, mechanism, token=None, points=None, frames=None, processor=None):
         self.mechanism, self.token = mechanism, token
         self.stream = shared_array(1, STREAM).reshape(())
         self.link, self.records = shared_array(LINK_SIZE, np.dtype(np.int64)), shared_array(8, RECORD)
@@ -85,7 +85,7 @@ class Run:
         self.listener = open_channel("127.0.0.1", 0)
         self.address = f"127.0.0.1:{self.listener.getsockname()[1]}"
         lengths = leg_lengths(mechanism, home.position, home.rotation)
-        what = self.listener, token, self.workplace, "operator", PERIOD, self.records, self.link, self.stream
+        what = self.listener, token, self.workplace, "operator", PERIOD, self.records, self.link, self.stream, processor
         self.channel = FORK.Process(target=serve_channel, args=what)
         self.loop = FORK.Process(target=looped, args=(self.stream, lengths, self.kept, self.shared))
         for process in (self.channel, self.loop):
