@@ -38,6 +38,7 @@ from hil.rigs.position_loops import POSITION_LOOPS
 from plant.errors import InputError
 
 PERIOD = 0.02
+PATIENT = 0.4  # A rig of this period waits for answers longer than a busy machine delays them; the exchanges are PERIOD apart.
 CHANNELS = count()
 
 
@@ -115,7 +116,7 @@ def serving(config, machine=None, channel=None):
 @contextmanager
 def armed(config, machine=None, channel=None, lengths=False):
     with serving(config, machine, channel) as nodes:
-        rig = CanopenRig(config, PERIOD, lengths=lengths)
+        rig = CanopenRig(config, PATIENT, lengths=lengths)
         rig.open()
         rig.identify()
         rig.arm()
@@ -386,7 +387,7 @@ def test_late_and_double_frames_are_refused_and_counted(fd):
             faults["sent"] += 1
             if faults["sent"] % 10 == 0:
                 faults["late"] += 1
-                return [(1.3 * PERIOD, frame)]
+                return [(1.3 * PATIENT, frame)]
             if faults["sent"] % 10 == 5:
                 faults["double"] += 1
                 return [(0.0, frame), (0.0, frame)]
