@@ -26,11 +26,11 @@ import numpy as np
 from numpy.lib.recfunctions import repack_fields
 from numpy.typing import NDArray
 
-from hil.loop.records import COMPUTED, shared_array
+from hil.loop.records import COMPUTED, STAGES, shared_array
 from hil.progress import Progress, no_progress
 from hil.realtime.durations import Histogram, percentiles
 from hil.realtime.processes import PATIENCE_S, join_or_kill, started
-from hil.realtime.scheduling import processor_time
+from hil.realtime.scheduling import processor_time, stolen_time
 from hil.recording.mcap import read_run
 from hil.runs.operator import Operator
 from hil.runs.operator_messages import ChannelError
@@ -67,6 +67,7 @@ class Slice:
         records: (N,), of its cycles, of dtype `RECORD` or with `FIELDS` of it.
         seconds: that it lasted.
         channel, panel: processor time that these processes took [s].
+        stolen: time that a hypervisor kept the processors from running [s].
         frames, received: how often the picture changed, and bytes that the page received.
     """
 
@@ -75,6 +76,7 @@ class Slice:
     seconds: float
     channel: float
     panel: float
+    stolen: float
     frames: int
     received: int
 
@@ -83,11 +85,16 @@ class Slice:
         """Of computing and lateness, each (N,) [ns]."""
         return {"compute": self.records["stage_ns"][:, COMPUTED].sum(axis=1), "wake": self.records["late_ns"]}
 
+    @cached_property
+    def overran(self) -> NDArray[np.intp]:
+        """Indices of the cycles whose own work missed periods."""
+        busy = np.minimum(self.records["stage_ns"].sum(axis=1), self.records["cpu_ns"])
+        return np.flatnonzero((busy[:-1] > 1e9 / _RATE) & (self.records["missed"][1:] > 0))
+
     @property
     def missed(self) -> tuple[int, int]:
         """Periods that were missed by own work, and by the host."""
-        busy = np.minimum(self.records["stage_ns"].sum(axis=1), self.records["cpu_ns"])
-        own = int(self.records["missed"][1:][busy[:-1] > 1e9 / _RATE].sum())
+        own = int(self.records["missed"][self.overran + 1].sum())
         return own, int(self.records["missed"].sum()) - own
 
 
@@ -96,9 +103,11 @@ def measure_panel(seconds: float, progress: Progress = no_progress) -> dict[str,
 
     Returns:
         `without` and `with`: `compute_us` and `wake_us` (p50, p99, p999, max, n), `missed_own` and `missed_host` periods,
-        `channel_cores` and `panel_cores`, shares of a processor that these processes take, `frames_hz` and `bytes_per_s` that
-        the page receives, `histograms`. `ratios`: with over without, by `RATIOS`. `noise`: within which factor of 1 most
-        splits of the slices without in two halves stay, likewise. `refused`: measures for real time that the machine refuses.
+        `overran`: the cycles whose own work missed periods, with its processor time and that of each stage [us],
+        `channel_cores` and `panel_cores`, shares of a processor that these processes take, `stolen_cores` that a hypervisor
+        took, `frames_hz` and `bytes_per_s` that the page receives, `histograms`.
+        `ratios`: with over without, by `RATIOS`. `noise`: within which factor of 1 most splits of the slices without in two
+        halves stay, likewise. `refused`: measures for real time that the machine refuses.
 
     Raises:
         MissingPackageError: the panel's package is not installed.
@@ -177,9 +186,19 @@ def _figures(slices: list[Slice]) -> dict[str, Any]:
         histogram.add(durations)
         figures[f"{name}_us"], figures["histograms"][name] = percentiles(durations), histogram.bars()
     for name, field in (
-        ("channel_cores", "channel"), ("panel_cores", "panel"), ("frames_hz", "frames"), ("bytes_per_s", "received"),
+        ("channel_cores", "channel"), ("panel_cores", "panel"), ("stolen_cores", "stolen"),
+        ("frames_hz", "frames"), ("bytes_per_s", "received"),
     ):  # fmt: skip
         figures[name] = sum(getattr(each, field) for each in slices) / seconds
+    figures["overran"] = [
+        {
+            "cycle": int(record["cycle"]),
+            "cpu_us": float(record["cpu_ns"]) / 1e3,
+            "stages_us": dict(zip(STAGES, (record["stage_ns"] / 1e3).tolist(), strict=True)),
+        }
+        for each in slices
+        for record in each.records[each.overran]
+    ]
     return figures
 
 
@@ -193,6 +212,7 @@ class _Sample(NamedTuple):
     time: float
     channel: float
     panel: float
+    stolen: float
     frames: int
     received: int
 
@@ -227,7 +247,7 @@ def _measure_round(seconds: float) -> tuple[list[Slice], list[str]]:
         slices.append(
             Slice(
                 attached, records[within], end.time - begin.time, end.channel - begin.channel, end.panel - begin.panel,
-                end.frames - begin.frames, end.received - begin.received,
+                end.stolen - begin.stolen, end.frames - begin.frames, end.received - begin.received,
             )
         )  # fmt: skip
     return slices, refused
@@ -237,7 +257,7 @@ def _sample(operator: Operator, channel: int, panel: _Panel | None) -> _Sample:
     cycle = operator.ask("state")["telemetry"]["cycle"]
     frames, received = (0, 0) if panel is None else panel.counts.tolist()
     own = 0.0 if panel is None else processor_time(panel.process)
-    return _Sample(cycle, time.monotonic(), processor_time(channel), own, frames, received)
+    return _Sample(cycle, time.monotonic(), processor_time(channel), own, stolen_time(), frames, received)
 
 
 class _Mover:

@@ -142,11 +142,13 @@ def _panel(options: Namespace, figures: dict[str, Any]) -> None:
     table.add("missed by the host", f"{without['missed_host']}", f"{attached['missed_host']}", "", "", "")
     table.add("panel [processors]", "", f"{attached['panel_cores']:.3f}", "", "", f"{LIMITS['panel_cores']:.2f}")
     table.add("channel [processors]", f"{without['channel_cores']:.3f}", f"{attached['channel_cores']:.3f}", "", "", "")
+    table.add("stolen [processors]", *(f"{each['stolen_cores']:.4f}" for each in (without, attached)), "", "", "")
     table.add("new pictures [Hz]", "", f"{attached['frames_hz']:.1f}", "", "", f">= {LIMITS['frames_hz']:g}")
     table.print()
     print(
         f"{measured['rounds']} runs, {measured['seconds']:g} s without and with; the page receives "
-        f"{attached['bytes_per_s'] / 1e3:.0f} kB/s; noise: halves of the time without are within this factor of each other"
+        f"{attached['bytes_per_s'] / 1e3:.0f} kB/s; noise: halves of the time without are within this factor of each other; "
+        "stolen: kept from running by a hypervisor"
     )
     for text in measured["refused"]:
         print(f"without {text}")

@@ -193,6 +193,14 @@ def processor_time(process: int) -> float:
     return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
+def stolen_time() -> float:
+    """Time that a hypervisor has kept this machine's processors, taken together, from work that they had so far [s], to a
+    hundredth. 0 where there is no hypervisor, or where it does not tell.
+    """
+    total = Path("/proc/stat").read_text().partition("\n")[0].split()
+    return int(total[8]) / os.sysconf("SC_CLK_TCK")
+
+
 def _status(process: int | str) -> list[str]:
     """The fields of `/proc/PROCESS/stat` after the name, which may have blanks in it."""
     return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()

@@ -25,13 +25,14 @@ def made_up(attached, compute_us, late_us, cycles=2000, own=0, host=0, panel=0.0
     records["late_ns"] = round(1e3 * late_us)
     records["stage_ns"][::100, COMPUTED] *= 10
     records["late_ns"][::100] *= 10
+    records["cycle"] = np.arange(cycles)
     records["cpu_ns"] = records["stage_ns"].sum(axis=1)
     # The first cycle of each pair takes two periods; the second one has missed one. The host's were not busy all the time.
     for k in range(own + host):
         records["stage_ns"][10 + 2 * k] = 200_000
         records["cpu_ns"][10 + 2 * k] = 2_000_000 if k < own else 10_000
         records["missed"][11 + 2 * k] = 1
-    return Slice(attached, records, 2.0, channel=0.2, panel=panel, frames=frames, received=1000 * frames)
+    return Slice(attached, records, 2.0, channel=0.2, panel=panel, stolen=0.01, frames=frames, received=1000 * frames)
 
 
 def round_of(before=10.0, after=10.0, attached=10.0, **of_panel):
@@ -48,7 +49,7 @@ def test_ratios_are_of_all_slices_with_over_all_without():
     assert attached["compute_us"]["p50"] == pytest.approx(12.0, rel=1e-3) and attached["compute_us"]["n"] == 4000
     assert without["compute_us"]["n"] == 8000 and without["frames_hz"] == without["panel_cores"] == 0.0
     assert (attached["panel_cores"], attached["channel_cores"], attached["frames_hz"]) == pytest.approx((0.05, 0.1, 30.0))
-    assert attached["bytes_per_s"] == pytest.approx(30_000.0)
+    assert attached["bytes_per_s"] == pytest.approx(30_000.0) and attached["stolen_cores"] == pytest.approx(0.005)
     assert sum(attached["histograms"]["compute"][1]) == 4000
 
 
@@ -62,6 +63,8 @@ def test_noise_is_what_halves_without_a_panel_differ_by():
 def test_periods_count_as_missed_by_own_work_if_the_thread_was_busy():
     figures = figures_of(round_of(own=3, host=2))["with"]
     assert (figures["missed_own"], figures["missed_host"]) == (3, 2)
+    assert [each["cycle"] for each in figures["overran"]] == [10, 12, 14]
+    assert figures["overran"][0]["cpu_us"] == 2000.0 and set(figures["overran"][0]["stages_us"].values()) == {200.0}
 
 
 def test_each_limit_that_is_exceeded_is_told():

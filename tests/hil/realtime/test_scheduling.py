@@ -7,6 +7,7 @@ import subprocess
 import threading
 import time
 
+import psutil
 import pytest
 
 from hil.realtime import processes
@@ -19,6 +20,7 @@ from hil.realtime.scheduling import (
     processor_time,
     real_time,
     since_process_start,
+    stolen_time,
 )
 from plant.errors import InputError
 
@@ -85,6 +87,11 @@ def test_the_time_since_the_start_of_the_process_goes_on():
     first = since_process_start()
     time.sleep(0.05)
     assert 0.0 < first < since_process_start() < first + 60.0
+
+
+def test_stolen_time_is_the_hypervisors():
+    before, steal = stolen_time(), psutil.cpu_times().steal
+    assert before <= steal <= stolen_time()
 
 
 def test_the_processor_time_of_a_process_is_what_it_has_computed():
