@@ -8,7 +8,8 @@ information form: Y x = y for x = (m, f), which begins with nothing known. Of a 
     forget   Y <- Y - Z^T Z, y <- y - Z^T u                 white jerk; then Y and y fade with `MEMORY_S`
     update   Y <- Y + H^T R^-1 H, y <- y + H^T R^-1 z       z: mean reading less what the loop's pose predicts; H = (J, 1)
 
-so that Y and y hold what the last half second says about f, and how much the pose depends on that. No other part of the loop
+so that Y and y hold what the last half second says about f, and how much the pose depends on that. A window that a missed
+period interrupts is dropped: Y and y are carried over it, and the jerk in it is not known at all. No other part of the loop
 uses this filter's estimate, so that no fault of its own can bend the pose. The work of a window is spread over the cycles of
 the next one.
 """
@@ -56,6 +57,9 @@ _STEADY_FEEDBACK = 0.5
 _TIMING_S = 3e-4
 """How far the times of samples may be off, as IMUs have clocks of their own [s]."""
 
+_BRIDGED_WINDOWS = 3
+"""How much time between two windows may be lost by missed periods [windows]: a longer gap ends in a new beginning."""
+
 _JERKS, _NEXT = 6, 3
 _FAULT_STIFFNESS = 1e-4
 """How well the fault of an IMU that has been left out is known from the window before: the variance of a window's mean,
@@ -88,6 +92,9 @@ STATE = record_dtype(
     job=np.int64,  # the next job of the last full window
     step=np.int64,  # cycles since that window was full
     collected=np.int64,  # cycles in the present window
+    lost=np.int64,  # cycles since the last full window that are in no window
+    between=np.float64,  # time between the middles of the last two full windows [s]
+    follows=np.int64,  # whether the last full window directly follows the one before
     sum=(np.float64, (IMU_COUNT, READINGS)),  # of their samples
     trend_sum=(np.float64, (IMU_COUNT, 3)),  # of the forces, with weights from -1 to 1 over the window
     places=(np.int64, IMU_COUNT),  # of the samples around the middle of the window, sum, in half cycles
@@ -150,7 +157,7 @@ def step_fault_filter(
         p, s: dtypes `PARAMETERS` and `STATE`.
         sensors: dtype `SENSOR_GEOMETRY`.
         imus: samples and health; dtype `imu_health.STATE`.
-        missed: periods that were missed before this cycle; the filter then begins anew.
+        missed: periods that were missed before this cycle; they interrupt the window under way.
         pose: of the loop; dtype `pose_estimator.STATE`.
         legs: (6, 3), length, rate and acceleration that each leg should have. The path takes its motion from them: noise in
             the estimated one would turn the directions of which nothing is known, and pretend to know something of them.
@@ -160,7 +167,7 @@ def step_fault_filter(
         Whether a window has been taken with this cycle.
     """
     if missed > 0:
-        begin_anew(s)
+        _drop_window(p, s, missed)
     _collect(p, s, imus, pose, legs, commands)
     took = False
     if s.job < JOBS and s.windows > 0:
@@ -178,10 +185,19 @@ def step_fault_filter(
 @kernel
 def begin_anew(s: Record) -> None:
     """Forget all that was read."""
-    s.windows = s.collected = 0
+    s.windows = s.collected = s.lost = 0
     s.job = JOBS
     s.information[:] = 0.0
     s.vector[:] = 0.0
+
+
+@kernel
+def _drop_window(p: Record, s: Record, missed: int) -> None:
+    """Leave out the window under way, with the periods that were missed."""
+    s.lost += s.collected + missed
+    s.collected = 0
+    if s.lost > _BRIDGED_WINDOWS * p.window:
+        begin_anew(s)
 
 
 @kernel
@@ -269,8 +285,11 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         place = s.places[k] / p.window
         for i in range(3):
             s.trend[k, i] = (s.trend_sum[k, i] - place * s.mean[k, 3 + i]) / s.samples[k]
+    s.follows = s.windows > 0 and s.lost == 0
+    s.between = p.duration * (1.0 + s.lost / p.window)
+    s.lost = 0
     if s.windows > 0:
-        _find_shift(p.duration, s.path, s.next_path, s.turn, s.shift)
+        _find_shift(s.between, s.path, s.next_path, s.turn, s.shift)
     s.path.position[:] = s.next_path.position
     s.path.rotation[:] = s.next_path.rotation
     s.path.motion[:] = s.next_path.motion
@@ -304,7 +323,7 @@ def _do(p: Record, s: Record, sensors: Record, excluded: Array, job: int) -> Non
         at = s.path
         predict_readings(sensors, at.position, at.rotation, at.motion, True, s.predicted, s.jacobian, s.readings_scratch)
     elif job == 1:
-        _carry(p.duration, s.turn, s.shift, s.information, s.vector)
+        _carry(s.between, s.turn, s.shift, s.information, s.vector)
     elif job == 2:
         _forget(p, s, s.information, s.vector)
     else:
@@ -354,8 +373,8 @@ def _carry(t: float, turn: Array, shift: Array, information: Array, vector: Arra
 
 @kernel
 def _forget(p: Record, s: Record, information: Array, vector: Array) -> None:
-    """Let jerk, constant for the window and different in each, take away information, and let all of it fade."""
-    t, a, z, u = p.duration, information, s.root, s.root_vector
+    """Let jerk, constant between two windows and different each time, take away information, and let all of it fade."""
+    t, a, z, u = s.between, information, s.root, s.root_vector
     by_place, by_speed = t * t * t / 6.0, 0.5 * t * t
     for n in range(_JERKS):
         row, place, speed, change = z[n], a[n], a[6 + n], a[12 + n]
@@ -365,7 +384,8 @@ def _forget(p: Record, s: Record, information: Array, vector: Array) -> None:
     for n in range(_JERKS):
         for m in range(_JERKS):
             s.factor[n, m] = by_place * z[n, m] + by_speed * z[n, 6 + m] + t * z[n, 12 + m]
-        s.factor[n, n] += p.stiffness[n // 3]
+        # In missed periods drives hold their rates, and then catch up: no plan has that jerk.
+        s.factor[n, n] += p.stiffness[n // 3] if s.follows != 0 else 0.0
     _take_away(s, information, vector, p.keep)
 
 

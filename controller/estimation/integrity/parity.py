@@ -195,7 +195,7 @@ def _squared_error(s: Record, f: Record, k: int) -> float:
 def _unplanned_turning(s: Record, f: Record, duration: float) -> float:
     """The greatest angular acceleration of an IMU that was not planned, by the change of the twist [rad/s^2]."""
     most = 0.0
-    if f.windows <= 1:
+    if f.follows == 0:
         return most
     for k in range(IMU_COUNT):
         squared = 0.0
@@ -220,7 +220,7 @@ def _learn_usual(s: Record, f: Record, excluded: Array, share: float) -> None:
 @kernel
 def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duration: float, shaking: Record) -> None:
     """Find what the forces of this window and the last one show beyond the change of the twist between them."""
-    follows, used, lasting, no_motion = f.windows > 1, 0, 0, shaking.no_motion
+    follows, used, lasting, no_motion = f.follows != 0, 0, 0, shaking.no_motion
     for k in range(IMU_COUNT):
         used += _counts(f, excluded, k)
     rough = _ROUGH_SIGMAS * f.rough

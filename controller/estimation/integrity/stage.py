@@ -72,6 +72,7 @@ LIMITS: Limits = {
     "filter.job": (0, fault_filter.JOBS),
     "filter.step": (0, MOST),
     "filter.collected": (0, MOST),
+    "filter.lost": (0, MOST),
     "evidence.waits": (0, evidence.LATE),
     "evidence.windows": (0, MOST),
     "evidence.order": (0, IMU_COUNT - 1),
@@ -124,9 +125,6 @@ def step_integrity(
     if p.filter.active == 0:
         return
     s.unjudged_for += elapsed(rig, time)
-    if time.missed > 0:
-        evidence.end_blur(p.evidence, s.evidence, s.step)
-        s.step = s.cycle = 0
     took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, time.missed, pose, legs, commands)
     if s.filter.job > 0 and s.compared != s.filter.windows:
         s.compared = s.filter.windows

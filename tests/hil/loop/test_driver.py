@@ -73,6 +73,23 @@ def test_the_stages_that_are_timed_are_the_cycle():
         assert len(STAGES) == written(loop)["stage_ns"].shape[1]
 
 
+@pytest.mark.parametrize("fusion", ["compiled", "whole"])
+def test_missed_periods_hardly_raise_the_protection_level(fusion):
+    """The evidence lasts over missed periods: beginning anew after each would raise the level fivefold at times."""
+    levels = []
+    ends = np.cumsum(np.random.default_rng(4).integers(200, 1100, 9)).tolist()
+    for late in ({}, {end: (1 + k % 5) * MS for k, end in enumerate(ends)}):
+        with prepared_loop(replace(CONFIG, duration=8.0, fusion=fusion)) as loop:
+            assert scripted(loop, late, cycles=10_000).run(8000) == Cause.NONE
+            records = written(loop)
+        assert np.count_nonzero(records["missed"]) == len(late)
+        settled = records[3000:]
+        error = np.linalg.norm(settled["position"] - settled["truth"][:, :3], axis=1)
+        assert (error < settled["protection"][:, 0]).all()
+        levels.append(settled["protection"].max(axis=0))
+    assert (levels[1] < 1.3 * levels[0]).all()
+
+
 def test_without_disturbance_a_clock_changes_nothing():
     with prepared_loop(CONFIG) as free, prepared_loop(CONFIG) as timed:
         free.run(1000)

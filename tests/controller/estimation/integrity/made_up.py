@@ -49,12 +49,20 @@ def constants(mechanism, **changes):
     return parameters, state
 
 
-def filtered(mechanism, r, parameters, state, off=(0.0,) * 6, count=None):
-    """Run the fault filter over readings, around poses that are `off` (6,) the true ones [m, rad]; returns how many windows."""
+def filtered(mechanism, r, parameters, state, off=(0.0,) * 6, count=None, missed=None):
+    """Run the fault filter over readings, around poses that are `off` (6,) the true ones [m, rad]; returns how many windows.
+
+    `missed` says by number before which samples how many others are missed.
+    """
     p, s = parameters[()], state[()]
-    taken = 0
+    taken = gap = 0
     turn = rotation_from_vector(np.array(off[3:]))
+    gaps = missed or {}
+    lost = {k for i, n in gaps.items() for k in range(i - n, i)}
     for i in range(len(r.samples) if count is None else count):
+        if i in lost:
+            gap += 1
+            continue
         s["imus"]["sample"] = r.samples[i]
         s["pose"]["position"], s["pose"]["rotation"] = r.positions[i] + off[:3], turn @ r.rotations[i]
         place_legs(mechanism, s["pose"])
@@ -62,8 +70,9 @@ def filtered(mechanism, r, parameters, state, off=(0.0,) * 6, count=None):
         f = s["integrity"]["filter"]
         legs = s["reference"]["motion"]
         taken += step_fault_filter(
-            p["integrity"]["filter"], f, p["rig"]["sensors"], s["imus"], 0, s["pose"], legs, legs[:, 1].copy()
+            p["integrity"]["filter"], f, p["rig"]["sensors"], s["imus"], gap, s["pose"], legs, legs[:, 1].copy()
         )  # fmt: skip
+        gap = 0
     return taken
 
 

@@ -87,6 +87,56 @@ def test_it_forgets():
     assert (weights[:, 0] < 1.001 * expected[0]).all()
 
 
+def gaps(lost, seed, apart=(60, 160)):
+    """By number before which samples how many are missed, now and then."""
+    ends = np.cumsum(np.random.default_rng(seed).integers(*apart, 12))
+    return {int(end): lost for end in ends if end < 900}
+
+
+@pytest.mark.parametrize("kind", ["static", "0.5", "mixed"])
+@pytest.mark.parametrize("lost", [1, 3, 9])
+def test_what_was_read_before_a_missed_period_still_counts(kind, lost):
+    """Windows of five samples: one is dropped at each gap, and the rest says as much as without gaps, and the truth."""
+    squares, knowledge = [], []
+    for seed in range(4):
+        mechanism, r = readings(kind, 2.0, seed)
+        deviations = []
+        for missed in ({}, gaps(lost, seed)):
+            parameters, state = constants(mechanism)
+            taken = filtered(mechanism, r, parameters, state, missed=missed)
+            whole = (len(r.samples) - lost * len(missed)) // 5
+            assert whole - 1 - len(missed) <= taken <= whole
+            found, covariance = faults_of(state, KNOWN)
+            variances = np.diag(covariance)
+            deviations.append(np.sqrt(variances))
+        share = variances[MOTION_STATES:] < 0.1 * KNOWN**2
+        squares.append((found[MOTION_STATES:] ** 2 / variances[MOTION_STATES:])[share].mean())
+        knowledge.append(deviations[1] / deviations[0])
+    assert 0.03 < np.mean(squares) < 1.2
+    # Of the pose and of all faults. A window's rate and acceleration are worth less without the one before.
+    steady = [*range(6), *range(MOTION_STATES, UNKNOWNS)]
+    assert np.max(np.array(knowledge)[:, steady]) < 1.25 and np.mean(np.array(knowledge)[:, steady]) < 1.03
+
+
+@pytest.mark.parametrize(("lost", "begins_anew"), [(15, False), (16, True)])
+def test_after_a_long_gap_it_begins_anew(lost, begins_anew):
+    mechanism, r = readings("0.5", 1.0, 5)
+    parameters, state = constants(mechanism)
+    # The last window before the gap is full.
+    filtered(mechanism, r, parameters, state, missed={300 + lost: lost}, count=300 + lost + 5)
+    assert state["integrity"]["filter"]["windows"] == (1 if begins_anew else 61)
+    assert state["integrity"]["filter"]["between"] == pytest.approx(0.01 if begins_anew else 0.04)
+
+
+def test_many_short_gaps_without_a_window_between_them_are_a_long_one():
+    mechanism, r = readings("0.5", 1.0, 5)
+    parameters, state = constants(mechanism)
+    missed = {300 + 4 * k: 1 for k in range(1, 6)}
+    filtered(mechanism, r, parameters, state, missed=missed, count=324)
+    assert state["integrity"]["filter"]["windows"] <= 1
+    assert np.isfinite(state["integrity"]["filter"]["information"]).all()
+
+
 def test_an_imu_that_is_not_healthy_tells_nothing():
     mechanism, r = readings("0.5", 1.0, 5)
     r.samples[:, :, 3] = np.nan
