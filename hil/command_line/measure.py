@@ -139,6 +139,8 @@ def _panel(options: Namespace, figures: dict[str, Any]) -> None:
             ratio, noise = (measured[kind][name][key] for kind in ("ratios", "noise"))
             table.add(f"{label} {which} [us]", *cells, f"{ratio:.3f}", f"{noise:.3f}", f"{LIMITS[key]:.2f}")
     table.add("missed by own work", f"{without['missed_own']}", f"{attached['missed_own']}", "", "", f"{LIMITS['missed_own']}")
+    cycles = (f"{len(each['overran'])} ({each['stalled']:.1f})" for each in (without, attached))
+    table.add("cycles of these (by stalls)", *cycles, "", "", "")
     table.add("missed by the host", f"{without['missed_host']}", f"{attached['missed_host']}", "", "", "")
     table.add("panel [processors]", "", f"{attached['panel_cores']:.3f}", "", "", f"{LIMITS['panel_cores']:.2f}")
     table.add("channel [processors]", f"{without['channel_cores']:.3f}", f"{attached['channel_cores']:.3f}", "", "", "")
@@ -147,8 +149,9 @@ def _panel(options: Namespace, figures: dict[str, Any]) -> None:
     table.print()
     print(
         f"{measured['rounds']} runs, {measured['seconds']:g} s without and with; the page receives "
-        f"{attached['bytes_per_s'] / 1e3:.0f} kB/s; noise: halves of the time without are within this factor of each other; "
-        "stolen: kept from running by a hypervisor"
+        f"{attached['bytes_per_s'] / 1e3:.0f} kB/s; ratio: median over the runs; noise: such medians of the time without are "
+        "within this factor of 1; by stalls: as many are expected, as the host stops the thread at work as often as it works; "
+        "stolen: kept from running by a hypervisor that tells"
     )
     for text in measured["refused"]:
         print(f"without {text}")
