@@ -148,16 +148,13 @@ def fault_filter_parameters(fusion: FusionSettings, rate: float, active: bool) -
 
 
 @shared_kernel
-def step_fault_filter(
-    p: Record, s: Record, sensors: Record, imus: Record, missed: int, pose: Record, legs: Array, commands: Array
-) -> bool:
+def step_fault_filter(p: Record, s: Record, sensors: Record, imus: Record, pose: Record, legs: Array, commands: Array) -> bool:
     """Take the calibrated samples of a cycle from the IMUs that are healthy, and do the cycle's share of work.
 
     Args:
         p, s: dtypes `PARAMETERS` and `STATE`.
         sensors: dtype `SENSOR_GEOMETRY`.
         imus: samples and health; dtype `imu_health.STATE`.
-        missed: periods that were missed before this cycle; they interrupt the window under way.
         pose: of the loop; dtype `pose_estimator.STATE`.
         legs: (6, 3), length, rate and acceleration that each leg should have. The path takes its motion from them: noise in
             the estimated one would turn the directions of which nothing is known, and pretend to know something of them.
@@ -166,8 +163,6 @@ def step_fault_filter(
     Returns:
         Whether a window has been taken with this cycle.
     """
-    if missed > 0:
-        _drop_window(p, s, missed)
     _collect(p, s, imus, pose, legs, commands)
     took = False
     if s.job < JOBS and s.windows > 0:
@@ -192,12 +187,11 @@ def begin_anew(s: Record) -> None:
 
 
 @kernel
-def _drop_window(p: Record, s: Record, missed: int) -> None:
-    """Leave out the window under way, with the periods that were missed."""
+def bridges(p: Record, s: Record, missed: int) -> bool:
+    """Leave out the window under way, as periods were missed; returns whether what was read before them still counts."""
     s.lost += s.collected + missed
     s.collected = 0
-    if s.lost > _BRIDGED_WINDOWS * p.window:
-        begin_anew(s)
+    return bool(s.lost <= _BRIDGED_WINDOWS * p.window)
 
 
 @kernel

@@ -65,7 +65,9 @@ STEPS = _FIRST_TOTAL + IMU_COUNT
 """Steps of an evaluation."""
 
 _CORRECTION_S = 0.1
-"""How long the loop takes to correct the pose when an IMU has been left out or taken back [s]; no plan has that motion."""
+"""How long the loop takes to correct the pose when an IMU has been left out or taken back, or after many missed periods [s]; no
+plan has that motion.
+"""
 
 LIMITS: Limits = {
     "filter.windows": (0, MOST),
@@ -125,7 +127,9 @@ def step_integrity(
     if p.filter.active == 0:
         return
     s.unjudged_for += elapsed(rig, time)
-    took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, time.missed, pose, legs, commands)
+    if time.missed > 0 and not fault_filter.bridges(p.filter, s.filter, time.missed):
+        restart_integrity(p, s)
+    took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, pose, legs, commands)
     if s.filter.job > 0 and s.compared != s.filter.windows:
         s.compared = s.filter.windows
         s.contradicts = s.filter.windows > 0 and (
@@ -159,7 +163,9 @@ def step_integrity(
 
 @kernel
 def restart_integrity(p: Record, s: Record) -> None:
-    """Forget the last half second, as the set of IMUs that are relied upon has changed; what was learned before it stays."""
+    """Forget the last half second, as the loop is about to correct the pose: the set of IMUs that are relied upon has changed,
+    or many periods have been missed. What was learned before it stays.
+    """
     s.waits = p.correction_cycles
     evidence.end_blur(p.evidence, s.evidence, s.step)
     s.step = s.cycle = 0

@@ -90,6 +90,19 @@ def test_missed_periods_hardly_raise_the_protection_level(fusion):
     assert (levels[1] < 1.3 * levels[0]).all()
 
 
+@pytest.mark.parametrize(("missed", "waits"), [(5, 0), (50, 99)])
+def test_after_many_missed_periods_evidence_waits_until_the_pose_is_corrected(missed, waits):
+    with prepared_loop(CONFIG) as loop:
+        loop.most_missed = 1000
+        assert scripted(loop, {1000: missed * MS}).run(1001) == Cause.NONE
+        integrity = loop.state["integrity"]
+        before = int(integrity["filter"]["windows"])
+        assert integrity["waits"] == waits and (before > 50) == (waits == 0)
+        assert loop.run(1001 + 150) == Cause.NONE
+        assert integrity["waits"] == 0
+        assert integrity["filter"]["windows"] == pytest.approx((150 - waits) / 10 + before * (waits == 0), abs=1)
+
+
 def test_without_disturbance_a_clock_changes_nothing():
     with prepared_loop(CONFIG) as free, prepared_loop(CONFIG) as timed:
         free.run(1000)
