@@ -308,9 +308,13 @@ def _operated_run(recording: Path, summary: Path) -> Iterator[tuple[Operator, st
         _await(lambda: run.poll() is not None or _moves(address), "the run does not begin", _START_S)
         if run.poll() is not None:
             raise _ended(run)
-        with Operator(address, name="gough bench") as operator:
-            yield operator, address
-            operator.end()
+        try:
+            with Operator(address, name="gough bench") as operator:
+                yield operator, address
+                operator.end()
+        except ChannelError as error:
+            _await(lambda: run.poll() is not None, f"{error}, and the run does not end")
+            raise _ended(run) from error
         _await(lambda: run.poll() is not None, "the run does not end")
         if run.returncode != 0:
             raise _ended(run)
