@@ -289,11 +289,10 @@ def tune(
         preset, margins(found[0], preset), setup.rate, preset.hold, tuple(found),
     )  # fmt: skip
     progress(0.7)
-    hold = shortest_hold(mechanism, setup, gains, where)
-    progress(0.9)
+    hold = shortest_hold(mechanism, setup, gains, where, lambda share: progress(0.7 + 0.2 * share))
     worst = [design.worst(name) for name in ("gain margin", "phase margin", "sensitivity peak, all loops")]
     critical = {id(each): each.pose for each in worst if each is not None}
-    lowest = lowest_stable_rate(mechanism, setup, gains, [home, *critical.values()])
+    lowest = lowest_stable_rate(mechanism, setup, gains, [home, *critical.values()], lambda share: progress(0.9 + 0.1 * share))
     return replace(design, lowest_rate=lowest, hold=hold)
 
 
@@ -392,7 +391,9 @@ def _rounded_up(time: float) -> float:
     return float(np.ceil(100.0 * time - 1e-9) / 100.0)
 
 
-def lowest_stable_rate(mechanism: Mechanism, setup: Setup, gains: ControlSettings, poses: Sequence[Pose]) -> float:
+def lowest_stable_rate(
+    mechanism: Mechanism, setup: Setup, gains: ControlSettings, poses: Sequence[Pose], progress: Progress = _silent
+) -> float:
     """The lowest rate [Hz] at which the loop is stable at all of these poses, with gains and delay as they are.
 
     It is the lowest of the rates that lead down to it without an unstable one in between, to 1 %.
@@ -409,15 +410,19 @@ def lowest_stable_rate(mechanism: Mechanism, setup: Setup, gains: ControlSetting
         if not stable(low):
             break
         high = low
+        progress(0.8 * float(np.log(setup.rate / low) / np.log(setup.rate / least)))
     else:
         return least
     while high / low > 1.01:
         middle = float(np.sqrt(low * high))
         low, high = (low, middle) if stable(middle) else (middle, high)
+        progress(1.0 - 0.2 * (high / low - 1.0))
     return high
 
 
-def shortest_hold(mechanism: Mechanism, setup: Setup, gains: ControlSettings, poses: Sequence[Pose]) -> float:
+def shortest_hold(
+    mechanism: Mechanism, setup: Setup, gains: ControlSettings, poses: Sequence[Pose], progress: Progress = _silent
+) -> float:
     """The shortest time on the brakes, from `hold` of the gains on, after which the loop is stable at all poses [s].
 
     Raises:
@@ -425,7 +430,12 @@ def shortest_hold(mechanism: Mechanism, setup: Setup, gains: ControlSettings, po
     """
     left, hold = list(poses), gains.hold
     while left:
-        left = [pose for pose in left if not is_stable(closed_poles(open_loop(mechanism, setup, pose, hold), gains))]
+        unstable = []
+        for tried, pose in enumerate(left, start=1):
+            if not is_stable(closed_poles(open_loop(mechanism, setup, pose, hold), gains)):
+                unstable.append(pose)
+            progress(1.0 - (len(left) - tried + len(unstable)) / len(poses))
+        left = unstable
         if left and hold >= SETTLED_S:
             raise SingularConfigurationError(f"the loop is unstable {hold:g} s after its start: choose smaller gains")
         hold = min(_LONGER * hold, SETTLED_S) if left else hold

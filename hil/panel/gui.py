@@ -12,9 +12,8 @@ _SHOWN_S = 8.0
 def set_theme(gui: viser.GuiApi) -> None:
     """Give a page the accent of reports, and its controls their place."""
     accent = rgb(LIGHT["accent"])
-    gui.configure_theme(
-        control_layout="collapsible", control_width="medium", show_logo=False, show_share_button=False, brand_color=accent
-    )
+    gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False, brand_color=accent)
+    gui.main_panel.dock_right()
 
 
 def set_text(handle: Any, text: str) -> None:

@@ -192,7 +192,9 @@ def first_order(rate):
 def test_the_lowest_rate_is_where_the_poles_leave_the_unit_circle(monkeypatch):
     gains = ControlSettings(proportional=80.0, integral=100.0)
     monkeypatch.setattr(tuning, "open_loop", lambda mechanism, setup, pose: first_order(setup.rate))
-    lowest = lowest_stable_rate(None, Setup(1000.0), gains, [None])
+    shares = []
+    lowest = lowest_stable_rate(None, Setup(1000.0), gains, [None], shares.append)
+    assert shares == sorted(shares) and 0.99 < shares[-1] <= 1.0 and len(set(shares)) > 8
     assert 50.0 < lowest < 500.0
     assert is_stable(closed_poles(first_order(lowest), gains))
     assert not is_stable(closed_poles(first_order(0.98 * lowest), gains))
@@ -210,7 +212,9 @@ def test_the_hold_is_the_shortest_after_which_the_loop_is_stable_at_all_poses(mo
     gains = ControlSettings(proportional=80.0, integral=100.0, hold=0.2)
     assert not is_stable(closed_poles(first_order(60.0), gains))
     monkeypatch.setattr(tuning, "open_loop", opened)
-    hold = shortest_hold(None, Setup(1000.0), gains, [0.0, 0.5, 0.3])
+    shares = []
+    hold = shortest_hold(None, Setup(1000.0), gains, [0.0, 0.5, 0.3], shares.append)
+    assert shares == sorted(shares) and shares[0] == pytest.approx(1.0 / 3.0) and shares[-1] == 1.0
     assert 0.5 <= hold < 0.5 * 1.25
     assert [pose for pose, _ in asked].count(0.0) == 1
     assert shortest_hold(None, Setup(1000.0), gains, [0.0]) == 0.2
