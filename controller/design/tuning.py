@@ -412,6 +412,7 @@ def lowest_stable_rate(
         high = low
         progress(0.8 * float(np.log(setup.rate / low) / np.log(setup.rate / least)))
     else:
+        progress(1.0)
         return least
     while high / low > 1.01:
         middle = float(np.sqrt(low * high))

@@ -187,9 +187,9 @@ def begin_anew(s: Record) -> None:
 
 
 @kernel
-def bridges(p: Record, s: Record, missed: int) -> bool:
+def bridge_gap(p: Record, s: Record, missed: int) -> bool:
     """Leave out the window under way, as periods were missed; returns whether what was read before them still counts."""
-    s.lost += s.collected + missed
+    s.lost = s.lost + s.collected + missed if s.windows > 0 else missed
     s.collected = 0
     return bool(s.lost <= _BRIDGED_WINDOWS * p.window)
 
@@ -280,7 +280,7 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         for i in range(3):
             s.trend[k, i] = (s.trend_sum[k, i] - place * s.mean[k, 3 + i]) / s.samples[k]
     s.follows = s.windows > 0 and s.lost == 0
-    s.between = p.duration * (1.0 + s.lost / p.window)
+    s.between = p.duration * (1.0 + s.lost / p.window if s.windows > 0 else 1.0)
     s.lost = 0
     if s.windows > 0:
         _find_shift(s.between, s.path, s.next_path, s.turn, s.shift)
@@ -379,8 +379,8 @@ def _forget(p: Record, s: Record, information: Array, vector: Array) -> None:
         for m in range(_JERKS):
             s.factor[n, m] = by_place * z[n, m] + by_speed * z[n, 6 + m] + t * z[n, 12 + m]
         # In missed periods drives hold their rates, and then catch up: no plan has that jerk.
-        s.factor[n, n] += p.stiffness[n // 3] if s.follows != 0 else 0.0
-    _take_away(s, information, vector, p.keep)
+        s.factor[n, n] += p.stiffness[n // 3] if t == p.duration else 0.0
+    _take_away(s, information, vector, p.keep ** (t / p.duration))
 
 
 @kernel

@@ -221,13 +221,16 @@ def _learn_usual(s: Record, f: Record, excluded: Array, share: float) -> None:
 def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duration: float, shaking: Record) -> None:
     """Find what the forces of this window and the last one show beyond the change of the twist between them."""
     follows, used, lasting, no_motion = f.follows != 0, 0, 0, shaking.no_motion
+    after_gap = f.windows > 1 and not follows
     for k in range(IMU_COUNT):
         used += _counts(f, excluded, k)
     rough = _ROUGH_SIGMAS * f.rough
     s.steady = s.second = most = 0.0
     s.common = np.inf
     for k in range(IMU_COUNT):
-        s.off_motion[k] = no_motion[k] = 0.0
+        s.off_motion[k] = 0.0
+        if not after_gap:
+            no_motion[k] = 0.0
         if not _counts(f, excluded, k) or used < _ENOUGH:
             s.average[k] = 0.0
             s.shown_for[k] = 0
@@ -253,7 +256,8 @@ def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duratio
         s.common = min(s.common, shown)
         s.second, most = max(s.second, min(shown, most)), max(shown, most)
         lasts = follows and shown > max(OF_TWO, _OF_VIBRATION * np.sqrt(shaking.mean[k] + shaking.hidden[k]))
-        s.shown_for[k] = s.shown_for[k] + 1 if lasts else 0
+        if not after_gap:
+            s.shown_for[k] = s.shown_for[k] + 1 if lasts else 0
         lasting += s.shown_for[k] >= _WINDOWS_OF_TWO
         if follows:
             s.off_motion[k] = own

@@ -127,7 +127,7 @@ def step_integrity(
     if p.filter.active == 0:
         return
     s.unjudged_for += elapsed(rig, time)
-    if time.missed > 0 and not fault_filter.bridges(p.filter, s.filter, time.missed):
+    if time.missed > 0 and not fault_filter.bridge_gap(p.filter, s.filter, time.missed):
         restart_integrity(p, s)
     took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, pose, legs, commands)
     if s.filter.job > 0 and s.compared != s.filter.windows:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.cycle import STATE, cycle_parameters
-from controller.estimation.integrity.fault_filter import begin_anew, bridges, step_fault_filter
+from controller.estimation.integrity.fault_filter import begin_anew, bridge_gap, step_fault_filter
 from controller.settings import control_settings, fusion_settings
 from plant.dynamics.imposed_motion import impose
 from plant.mechanism import load_spatial
@@ -69,7 +69,7 @@ def filtered(mechanism, r, parameters, state, off=(0.0,) * 6, count=None, missed
         s["reference"]["motion"] = r.legs[i]
         f = s["integrity"]["filter"]
         legs = s["reference"]["motion"]
-        if gap > 0 and not bridges(p["integrity"]["filter"], f, gap):
+        if gap > 0 and not bridge_gap(p["integrity"]["filter"], f, gap):
             begin_anew(f)
         gap = 0
         taken += step_fault_filter(
