@@ -226,6 +226,23 @@ def test_a_force_that_two_accelerometers_go_on_to_show_is_told_after_twelve_wind
     assert first is None or 12 <= first <= 18
 
 
+def test_missed_periods_do_not_hide_what_two_accelerometers_go_on_to_show():
+    """A period is missed in every fifth window: fewer than twelve windows ever follow each other directly."""
+    mechanism, r = readings("0.5", 1.0, 2)
+    r.samples[:, 1, [2, 4]] += [0.0, 0.4, 0.3]
+    parameters, state = constants(mechanism)
+    s, f, first, before, broken = state["integrity"]["parity"], state["integrity"]["filter"], None, 0, 0
+    for n in range(60):
+        part = type(r)(*(each[5 * n + (n > 0) : 5 * n + 6] for each in vars(r).values()))
+        filtered(mechanism, part, parameters, state, missed={3: 1} if n % 5 == 4 else None)
+        if f["windows"] > before and f["job"] > 0:
+            before = int(f["windows"])
+            broken += not f["follows"]
+            parity(state)
+            first = n if s["two"] and first is None else first
+    assert broken > 8 and first is not None and 12 <= first <= 30
+
+
 @pytest.mark.parametrize("mean, hidden", [(1.0, 0.0), (0.0, 1.0)])
 def test_vibration_of_the_accelerometers_is_no_error_of_two(mean, hidden):
     mechanism, r = readings("0.5", 1.0, 2)
