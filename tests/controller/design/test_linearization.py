@@ -16,7 +16,7 @@ from plant.mechanism import Mechanism
 
 
 @pytest.mark.parametrize(
-    "model", [pytest.param(SPATIAL_MODEL, marks=pytest.mark.slow), PLANAR_MODEL], ids=lambda model: model.identifier
+    "model", [pytest.param(SPATIAL_MODEL, marks=pytest.mark.endurance), PLANAR_MODEL], ids=lambda model: model.identifier
 )
 @pytest.mark.parametrize("fmi", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_the_linear_plant_is_casadis(model: Model, fmi: int) -> None:

@@ -128,7 +128,12 @@ def displacements(random, kind, count):
 
 
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=pytest.mark.slow) for kind in ("waves", "leaps", "noise", "ramps")] + ["steps"]
+    "kind",
+    [
+        "steps",
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("waves", "ramps")),
+        *(pytest.param(kind, marks=pytest.mark.endurance) for kind in ("leaps", "noise")),
+    ],
 )
 @given(seed=st.integers(0, 2**32 - 1))
 def test_no_limit_is_left_whatever_comes(hexapod, kind, seed):

@@ -107,6 +107,7 @@ def test_any_browser_ends_the_run_at_once_though_another_program_operates_it(hex
         assert len(browser.notices) == 1
 
 
+@pytest.mark.slow
 def test_a_panel_leaves_the_processor_of_the_loop_to_it_until_the_run_has_ended(hexapod):
     everywhere = os.sched_getaffinity(0)
     kept = max(everywhere)

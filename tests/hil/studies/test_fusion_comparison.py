@@ -25,7 +25,7 @@ def test_every_method_is_there(figures):
         assert method["seeds"] == 1
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_the_whole_mechanism_beats_its_parts_and_the_parts_what_knows_no_joints(figures):
     error = {name: method["position_rms"] for name, method in figures.items()}
     assert error["whole"] < 0.5 * error["refined (compiled)"]
@@ -34,7 +34,7 @@ def test_the_whole_mechanism_beats_its_parts_and_the_parts_what_knows_no_joints(
     assert error["refined (filterpy)"] == pytest.approx(error["refined (compiled)"], rel=1e-6)
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_covariances_are_of_the_size_of_the_errors(figures):
     assert 0.5 < figures["whole"]["nees"] < 15.0
     assert figures["section 5, magnetometer"]["nees"] is None

@@ -88,7 +88,9 @@ class Run:
         return 1e3 * np.sqrt(np.mean(distance**2)), np.degrees(np.sqrt(np.mean(angle**2)))
 
 
-@pytest.mark.parametrize("errors", ["gyroscopes", pytest.param("accelerometers", marks=pytest.mark.slow), "alignments"])
+@pytest.mark.parametrize(
+    "errors", [*(pytest.param(each, marks=pytest.mark.slow) for each in ("gyroscopes", "accelerometers")), "alignments"]
+)
 @pytest.mark.parametrize(
     ("kind", "limits"),
     [

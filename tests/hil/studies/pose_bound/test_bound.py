@@ -25,7 +25,7 @@ def test_the_bound_falls_with_time_at_rest_and_faster_in_motion():
     [
         ({}, 2.0),
         ({"lengths": "absolute"}, 2.0),
-        ({"mechanism": "planar-3rpr", "lengths": "absolute"}, 2.0),
+        pytest.param({"mechanism": "planar-3rpr", "lengths": "absolute"}, 2.0, marks=pytest.mark.slow),
         ({"base_imu": True, "faults": ("base-tilt,axis=x,size_deg=3,sine_hz=0.125",)}, 2.0),
     ],
 )
