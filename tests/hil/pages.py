@@ -39,7 +39,7 @@ def dumped(page, profile):
     flags = "--headless --no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-component-update"
     run = subprocess.run(
         [browser, *flags.split(), "--virtual-time-budget=3000", f"--user-data-dir={profile}", "--dump-dom", f"file://{page}"],
-        capture_output=True, text=True, check=False, timeout=120,
+        capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
     return run.stdout, run.stderr
 
