@@ -15,6 +15,9 @@ from plant.pose import Array
 _STILL_S = 0.05
 """Over what time the estimate is averaged, to see whether it stands still [s]."""
 
+_READY_S = 0.1
+"""A dry run that is ready for arming stays so while the rig does not answer for less than this time [s]."""
+
 _AT_START_M = 1e-6
 """Closer than this to the start of the target there is no way to go."""
 
@@ -25,11 +28,13 @@ PARAMETERS = record_dtype(
     drift=np.float64,  # by how much a leg's mean length may change on the brakes, from one window to the next [m]
     approach=np.int64,  # whether the reference begins at the estimated lengths
     window=np.int64,  # samples of a length that are averaged
+    ready=np.int64,  # for how many cycles without an answer a dry run stays ready for arming
 )
 """The constants of arming."""
 
 STATE = record_dtype(
     delay=np.int64,  # how many cycles arming and the approach took beyond the hold
+    ready_for=np.int64,  # how many more such cycles a dry run bears
     obstacle=np.int64,  # what prevents it, a `Cause` with its leg or IMU, value and limit
     index=np.int64,
     value=np.float64,
@@ -58,6 +63,7 @@ def arming_parameters(settings: SafetySettings, rate: float, active: bool) -> Re
         drift=settings.arming_drift,
         approach=1,
         window=max(1, round(_STILL_S * rate)),
+        ready=0 if active else round(_READY_S * rate),
     )
 
 
@@ -98,7 +104,7 @@ def run_arming_checks(
     if time.cycle < rig.hold_cycles or s.mode > Mode.ARMED:
         return
     if s.mode == Mode.IDLE:
-        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, pose, pid)
+        _note(p.arming, a, *_find_obstacle(p, s, rig, imu_parameters, imus, pose, pid))
         if a.obstacle == Cause.NONE and p.arming.active != 0:
             s.mode, s.request = Mode.ARMED, Request.ENABLED
             report_event(s.events, Cause.ARMED, -1, np.nan, np.nan)
@@ -122,6 +128,17 @@ def run_arming_checks(
     a.delay = time.cycle + 1 - rig.hold_cycles
     if a.delay > p.arming.cycles:
         handle_cause(p, s, rig, time, reference, pid, a.obstacle, a.index, a.value, a.limit)
+
+
+@kernel
+def _note(p: Record, a: Record, cause: int, index: int, value: float, limit: float) -> None:
+    """Note what prevents arming in this cycle, `Cause.NONE` for nothing; a few late answers do not prevent it in a dry run."""
+    if cause == Cause.NONE:
+        a.ready_for = p.ready
+    elif cause == Cause.BUS_LOST and a.ready_for > 0:
+        a.ready_for -= 1
+        return
+    a.obstacle, a.index, a.value, a.limit = cause, index, value, limit
 
 
 @kernel
@@ -168,9 +185,10 @@ def postpones_arming(p: Record, s: Record, rig: Record, time: Record, cause: int
     a = s.arming
     if s.mode != Mode.IDLE:
         return False
-    a.obstacle, a.index, a.value, a.limit = cause, -1, np.nan, np.nan
     if s.watch.unanswered > 0:
-        a.obstacle, a.value, a.limit = Cause.BUS_LOST, _unanswered_for(s.watch), 0.0
+        _note(p.arming, a, Cause.BUS_LOST.value, -1, _unanswered_for(s.watch), 0.0)
+    else:
+        _note(p.arming, a, cause, -1, np.nan, np.nan)
     if time.cycle >= rig.hold_cycles and p.arming.active != 0:
         a.delay = time.cycle + 1 - rig.hold_cycles
     return bool(a.delay <= p.arming.cycles)

@@ -111,6 +111,26 @@ def test_without_answers_the_bus_is_blamed_and_no_imu(hexapod, to_arm, lost):
     assert (bench.mode, obstacle(bench)[0]) == (Mode.IDLE, Cause.BUS_LOST)
 
 
+def test_late_answers_do_not_change_the_verdict_of_a_dry_run_for_a_tenth_of_a_second(hexapod):
+    bench, few = Bench(hexapod, to_arm=False), round(0.1 * RATE_HZ)
+    bench.steps(bench.hold + 1, silent=1)
+    assert obstacle(bench)[0] == Cause.BUS_LOST
+    bench.steps(2 * bench.hold)
+    assert (bench.mode, describe_obstacle(bench.state)) == (Mode.IDLE, "")
+    # A stall of the loop takes none of that time.
+    skip_periods(bench.state, 2 * few)
+    bench.step(silent=1)
+    skip_periods(bench.state, 0)
+    bench.steps(few - 1, silent=1)
+    assert describe_obstacle(bench.state) == ""
+    bench.step(silent=1)
+    assert obstacle(bench)[0] == Cause.BUS_LOST
+    bench.steps(2 * bench.hold)
+    assert describe_obstacle(bench.state) == ""
+    bench.step(drive=DriveState.NOT_READY)
+    assert obstacle(bench)[0] == Cause.NO_DRIVES
+
+
 def test_an_imu_that_contradicts_the_others_is_in_the_way(hexapod):
     bench = Bench(hexapod)
     bench.steps(bench.hold - 1)
