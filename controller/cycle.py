@@ -37,6 +37,7 @@ from controller.estimation import (
     platform_filter,
     pose_estimator,
 )
+from controller.estimation.integrity import commanded
 from controller.estimation.integrity import stage as integrity
 from controller.estimation.integrity.protection import end_level
 from controller.estimation.whole_mechanism import trust
@@ -473,6 +474,11 @@ def _watch(parameters: Record, state: Record) -> int:
     """Judge the estimate and the commands; returns the cause of a fault, or `Cause.NONE`."""
     p, s = parameters[()], state[()]
     rig, time, pose = p.rig, s.time, s.pose
+    if p.integrity.filter.active != 0:
+        commanded.compare_with_commands(
+            s.integrity.commanded, rig, time, follows_commands(s.safety), p.safety.drives.lag + p.load.command_delay, p.load,
+            s.load, pose, s.reference, s.pid.command,
+        )  # fmt: skip
     if follows_commands(s.safety):
         watch.check_oscillation(
             p.safety, s.safety, rig, time, s.imus.shaking, s.load.feed_forward, s.reference, s.pid

@@ -51,6 +51,7 @@ STATE = record_dtype(
     misfit=np.float64,  # of the measurements about the refined pose, 1 on average if their covariances are right
     rest_misfit=np.float64,  # the same without the worst of the measurements; 0 with few measurements
     bent=(np.float64, 2),  # by how much an encoder could move it unseen, position [m] and rotation [rad]
+    apart=(np.float64, 2),  # distance of the closed form and the filter that is trusted [m, rad]; 0 unless there are both
     arms=(np.float64, (LEGS, 3)),  # the turned platform joints at the pose [m]
     directions=(np.float64, (LEGS, 3)),  # of the legs at the pose, unit
     lengths=(np.float64, LEGS),  # of the legs at the pose [m]

@@ -118,7 +118,8 @@ class Stages:
         directions: the legs' directions (L, 3) in {1}, in place of the leg filters'; NaN for a leg without one. The rates stay
             those of the leg filters.
         pose: the pose of {2} in {1}, in place of direct kinematics, refinement and whole-mechanism filter; None if there is
-            none, which ends the run by a quick stop. Twist, covariance and protection level stay those of gough's own estimate.
+            none, which ends the run by a quick stop. Twist, covariance and protection level stay those of gough's own estimate,
+            but a pose that moves otherwise than commanded raises the level.
         command: the velocity of each drive (L,) [m/s], in place of feed-forward and PID; it is cut off at the largest command.
             It is asked for while the platform follows the motion. A controlled stop is gough's.
     """

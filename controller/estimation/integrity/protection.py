@@ -14,7 +14,7 @@ The 8 is for faults that grow: such a fault is larger at the end of the filter's
 the pose before, and goes on until the next evaluation. A fault since the loop began has had little time to move the pose: these
 terms grow over the first four seconds.
 
-The level is the root of the sum of the squares of five terms:
+The level is the root of the sum of the squares of seven terms:
 
 1. The greatest of these.
 2. The standard deviation of the pose, both that of the closed form and that of the pose's own source if that is less: no filter
@@ -23,8 +23,11 @@ The level is the root of the sum of the squares of five terms:
    show themselves, and other errors that nothing models.
 4. What `parity` and `shaking` tell: forces that are no motion may have moved the pose.
 5. How far an encoder whose zero is known could move the pose unseen, as `encoders` has it.
+6. How far the pose has moved otherwise than commanded within a second, as `commanded` has it: so errors that all IMUs share
+   show themselves before there is evidence.
+7. How far the pose in closed form and that of the whole-mechanism filter are from each other.
 
-Terms 3 to 5 are renewed in every cycle.
+Terms 3 to 7 are renewed in every cycle; term 6 is that of the cycle before.
 """
 
 import numpy as np
@@ -54,7 +57,7 @@ _OF_CLOSED_FORM, _OF_SOURCE = (0.5, 1.4), (2.5, 1.4)
 the pose's source.
 """
 
-_USUAL_MISFIT, _OF_MISFIT, _MISFIT_S = 0.4, 2.0, 0.1
+_USUAL_MISFIT, _OF_MISFIT, _MISFIT_S = 0.3, 1.6, 0.1
 """A misfit up to the first is usual. Beyond it, the closed form's standard deviation counts so many times, times the root of
 the excess. The misfit is averaged with the time constant [s]. Sound IMUs have less than 1, as most of the errors that the
 weights stand for are alike in all measurements, or move the pose.
@@ -65,12 +68,18 @@ _SOUND, _MOST, _SHAKEN = 0.2, 1.0, 0.3
 vibration's RMS that counts with them.
 """
 
-_MOVED = 0.04, 0.06
+_BY_FORCE = 0.04, 0.06
 """How far such a force moves the pose [m, rad per m/s^2]: legs of 0.4 m that lean by its share of gravity."""
+
+_USUALLY_MOVED, _OF_MOVED = (1.5e-4, 1.5e-3), 1.8
+"""Motion that was not commanded counts beyond the first [m, rad], so many times."""
+
+_USUALLY_APART, _OF_APART = (5e-4, 2e-3), 0.8
+"""The distance of the two estimates counts beyond the first [m, rad], so many times."""
 
 STATE = record_dtype(
     level=(np.float64, 2),  # of position [m] and rotation [rad]
-    evaluated=(np.float64, 2),  # its square without what misfit and forces add, of the last complete evaluation
+    evaluated=(np.float64, 2),  # the square of its first two terms, of the last complete evaluation
     closed=(np.float64, 2),  # square of the closed form's standard deviation then
     misfit=np.float64,  # of the closed form, averaged
     hypothesis=(np.int64, 2),  # that gives the level; -1: none
@@ -174,7 +183,9 @@ def end_level(s: Record, age: float) -> None:
 
 
 @kernel
-def publish_level(s: Record, misfit: float, duration: float, steady: float, shaken: float, bent: Array) -> None:
+def publish_level(
+    s: Record, misfit: float, duration: float, steady: float, shaken: float, bent: Array, moved: Array, apart: Array
+) -> None:  # fmt: skip
     """Publish the level of a cycle, with what has come up since the last evaluation.
 
     Args:
@@ -184,9 +195,14 @@ def publish_level(s: Record, misfit: float, duration: float, steady: float, shak
         steady: greatest mean force that is no motion [m/s^2], `parity.STATE`.
         shaken: greatest mean square of vibration [m^2/s^4], `shaking.STATE`.
         bent: (2,), by how much an encoder could move position [m] and rotation [rad] unseen.
+        moved: (2,), by how much they have moved otherwise than commanded, `commanded.STATE`.
+        apart: (2,), how far the closed form and the filter that is trusted are from each other.
     """
     s.misfit += min(1.0, duration / _MISFIT_S) * (misfit - s.misfit)
     beyond = _OF_MISFIT**2 * max(s.misfit - _USUAL_MISFIT, 0.0)
     force = min(max(steady - _SOUND, 0.0) + _SHAKEN * np.sqrt(shaken), _MOST)
-    for part, moved in enumerate(_MOVED):
-        s.level[part] = np.sqrt(s.evaluated[part] + beyond * s.closed[part] + (moved * force) ** 2 + bent[part] ** 2)
+    for part in range(2):
+        squared = s.evaluated[part] + beyond * s.closed[part] + (_BY_FORCE[part] * force) ** 2 + bent[part] ** 2
+        squared += (_OF_MOVED * max(moved[part] - _USUALLY_MOVED[part], 0.0)) ** 2
+        squared += (_OF_APART * max(apart[part] - _USUALLY_APART[part], 0.0)) ** 2
+        s.level[part] = np.sqrt(squared)

@@ -4,7 +4,7 @@ every hypothesis.
 
 import numpy as np
 
-from controller.estimation.integrity import evidence, fault_filter, hypotheses, parity, protection
+from controller.estimation.integrity import commanded, evidence, fault_filter, hypotheses, parity, protection
 from controller.estimation.integrity.hypotheses import (
     HYPOTHESES,
     OF_ONE_IMU,
@@ -35,6 +35,7 @@ STATE = record_dtype(
     evidence=evidence.STATE,
     hypotheses=hypotheses.SCRATCH,
     protection=protection.STATE,
+    commanded=commanded.STATE,
     parity=parity.STATE,
     compared=np.int64,  # the last window of which the gyroscopes have been compared
     contradicts=np.int64,  # whether they contradict each other, or accelerometers show no motion, found in this cycle
@@ -139,7 +140,8 @@ def step_integrity(
         )
     if s.evaluations > 0:
         protection.publish_level(
-            s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max(), pose.bent
+            s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max(), pose.bent,
+            s.commanded.moved, pose.apart,
         )  # fmt: skip
     if s.waits > 0:
         s.waits -= 1

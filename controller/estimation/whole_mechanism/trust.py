@@ -35,6 +35,7 @@ from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.imu_wiring import IMU_COUNT
 from plant.mechanism import LEGS
 from plant.pose import Array
+from plant.vectors import dot, vector
 
 _FIRST_S, _START_S, _SETTLING_S, _SETTLING_AGAIN_S = 0.1, 0.3, 0.3, 1.0
 """The filter starts after the first time with few IMUs, and after the second when it was stopped. Its pose is used after the
@@ -123,6 +124,7 @@ def step_mechanism_filter(
         standing: whether the brakes hold the platform.
     """
     f, found = s.filter, bool(pose.found != 0)
+    pose.apart[:] = 0.0
     if p.filter.errors == 0:
         return found
     now = time.cycle * rig.period
@@ -175,6 +177,10 @@ def step_mechanism_filter(
         pose.twist[:] = s.twist
     if found:
         _find_step(s.closed_position, s.closed_rotation, pose.position, pose.rotation, s.step)
+        if s.trusted != 0:
+            for part in range(2):
+                step = vector(s.step[3 * part :])
+                pose.apart[part] = np.sqrt(dot(step, step))
         pose.position[:] = s.closed_position
         pose.rotation[:] = s.closed_rotation
         _correct(s, rig, time, pose)

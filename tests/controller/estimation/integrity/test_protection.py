@@ -11,13 +11,14 @@ from tests.controller.estimation.integrity.test_hypotheses import all_steps, rea
 
 OWN = np.array([np.diag([4e-8, 1e-8, 9e-8, 1e-6, 4e-6, 1e-6]), np.diag([1e-8, 2e-8, 3e-8, 2e-6, 1e-6, 3e-6])])
 """Covariances of the pose, in closed form and of its source."""
+NOT = (0.0, 0.0)
 
 
-def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=(0.0, 0.0)):
+def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, apart=NOT):
     """The level (2,) at the end of an evaluation, with a misfit that lasts."""
     level["covariance"], level["misfit"] = own, misfit
     end_level(level[()], age)
-    publish_level(level[()], misfit, 0.01, steady, shaken, np.array(bent))
+    publish_level(level[()], misfit, 0.01, steady, shaken, *(np.array(each) for each in (bent, moved, apart)))
     return level["level"].copy()
 
 
@@ -106,17 +107,27 @@ def test_forces_that_are_no_motion_raise_the_level_between_evaluations():
     np.testing.assert_allclose(ended(level, bent=(2e-4, 3e-3)), np.hypot(sound, [2e-4, 3e-3]))
 
 
+def test_what_was_not_commanded_and_two_estimates_that_are_apart_raise_the_level():
+    _, state = evaluated()
+    level = state["integrity"]["protection"]
+    level["determined"] = 1
+    sound = ended(level)
+    np.testing.assert_array_equal(ended(level, moved=(1.5e-4, 1.5e-3), apart=(5e-4, 2e-3)), sound)
+    np.testing.assert_allclose(ended(level, moved=(1.15e-3, 3.5e-3)), np.hypot(sound, [1.8e-3, 3.6e-3]))
+    np.testing.assert_allclose(ended(level, apart=(1.5e-3, 12e-3)), np.hypot(sound, [0.8e-3, 8e-3]))
+
+
 def test_measurements_that_contradict_each_other_raise_the_level_between_evaluations():
     _, state = evaluated("mixed", (), 1.5, 3)
     level = state["integrity"]["protection"]
     calm = ended(level)
-    np.testing.assert_array_equal(ended(level, misfit=0.39), calm)
+    np.testing.assert_array_equal(ended(level, misfit=0.29), calm)
     closed, _ = traces()
-    np.testing.assert_allclose(ended(level, misfit=2.4), np.sqrt(calm**2 + 4.0 * 2.0 * closed))
+    np.testing.assert_allclose(ended(level, misfit=2.3), np.sqrt(calm**2 + 1.6**2 * 2.0 * closed))
     # A misfit that has just come up counts by its share of the average.
-    level["misfit"] = 0.4
-    publish_level(level[()], 2.4, 0.01, 0.0, 0.0, np.zeros(2))
-    np.testing.assert_allclose(level["level"], np.sqrt(calm**2 + 4.0 * 0.2 * closed))
+    level["misfit"] = 0.3
+    publish_level(level[()], 2.3, 0.01, 0.0, 0.0, np.zeros(2), np.zeros(2), np.zeros(2))
+    np.testing.assert_allclose(level["level"], np.sqrt(calm**2 + 1.6**2 * 0.2 * closed))
     assert np.isinf(ended(level, own=np.full_like(OWN, np.inf), misfit=2.3)).all()
 
 
