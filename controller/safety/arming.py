@@ -104,12 +104,12 @@ def run_arming_checks(
     if time.cycle < rig.hold_cycles or s.mode > Mode.ARMED:
         return
     if s.mode == Mode.IDLE:
-        _note(p.arming, a, *_find_obstacle(p, s, rig, imu_parameters, imus, pose, pid))
+        _note(p.arming, a, *_find_obstacle(p, s, rig, imu_parameters, imus, integrity, pose, pid))
         if a.obstacle == Cause.NONE and p.arming.active != 0:
             s.mode, s.request = Mode.ARMED, Request.ENABLED
             report_event(s.events, Cause.ARMED, -1, np.nan, np.nan)
     if s.mode == Mode.ARMED:
-        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, pose, pid)
+        a.obstacle, a.index, a.value, a.limit = _find_obstacle(p, s, rig, imu_parameters, imus, integrity, pose, pid)
         if a.obstacle != Cause.NONE:
             # The drives are enabled already, so arming does not wait here.
             handle_cause(p, s, rig, time, reference, pid, a.obstacle, a.index, a.value, a.limit)
@@ -202,7 +202,7 @@ def _unanswered_for(watch: Record) -> float:
 
 @kernel
 def _find_obstacle(
-    p: Record, s: Record, rig: Record, imu_parameters: Record, imus: Record, pose: Record, pid: Record
+    p: Record, s: Record, rig: Record, imu_parameters: Record, imus: Record, integrity: Record, pose: Record, pid: Record
 ) -> tuple[int, int, float, float]:
     """The first obstacle: a `Cause` with its leg or IMU, value and limit."""
     # Without answers, nothing below is about the present.
@@ -215,6 +215,10 @@ def _find_obstacle(
         blamed = s.arming.blamed[most]
         cause = Cause.NO_TRUST.value if blamed < 0 else Cause.NO_SENSORS.value
         return cause, blamed, np.sqrt(s.arming.evidence[most]), np.sqrt(p.watch.evidence)
+    level = integrity.protection.level
+    for part, cause in enumerate((Cause.POSITION_UNSURE.value, Cause.ROTATION_UNSURE.value)):
+        if integrity.evaluations > 0 and not level[part] <= p.watch.level[part]:
+            return cause, -1, level[part], p.watch.level[part]
     for k in range(IMU_COUNT):
         off = contradiction(s.monitor, k)
         if not off <= p.monitor.disagreement:

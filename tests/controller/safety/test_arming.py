@@ -131,6 +131,22 @@ def test_late_answers_do_not_change_the_verdict_of_a_dry_run_for_a_tenth_of_a_se
     assert obstacle(bench)[0] == Cause.NO_DRIVES
 
 
+@pytest.mark.parametrize("to_arm", [True, False])
+@pytest.mark.parametrize(("part", "cause"), [(0, Cause.POSITION_UNSURE), (1, Cause.ROTATION_UNSURE)])
+def test_a_level_beyond_its_limit_is_in_the_way(hexapod, to_arm, part, cause):
+    bench = Bench(hexapod, to_arm=to_arm)
+    limits = bench.parameters["safety"]["watch"]["level"]
+    assert np.isinf(limits).all()
+    limits[part] = 1e-9
+    bench.steps(bench.hold + 50)
+    level = float(bench.state["integrity"]["protection"]["level"][part])
+    assert bench.mode == Mode.IDLE and level > 1e-6
+    assert obstacle(bench) == (cause, -1, level, 1e-9)
+    limits[part] = np.inf
+    bench.step()
+    assert bench.mode == (Mode.RUNNING if to_arm else Mode.IDLE) and describe_obstacle(bench.state) == ""
+
+
 def test_an_imu_that_contradicts_the_others_is_in_the_way(hexapod):
     bench = Bench(hexapod)
     bench.steps(bench.hold - 1)
