@@ -1,7 +1,6 @@
 """Checks of numbers that several configurations share, and foreign texts and wrong names as messages show them."""
 
 from collections.abc import Iterable
-from math import inf
 from numbers import Integral
 
 from plant.errors import InputError
@@ -18,10 +17,14 @@ def check_rate(rate: float) -> None:
         raise InputError(f"the rate is {rate:g} Hz; it must be {RATE_RANGE_HZ[0]:g} to {RATE_RANGE_HZ[1]:g} Hz")
 
 
+LONGEST_S = 1e6
+"""The longest duration of a motion [s]."""
+
+
 def check_duration(duration: float) -> None:
-    """Check a motion's duration [s]: positive and finite, or an `InputError`."""
-    if not 0.0 < duration < inf:
-        raise InputError(f"the duration is {duration:g} s; it must be positive and finite")
+    """Check a motion's duration [s]: positive and at most `LONGEST_S`, or an `InputError`."""
+    if not 0.0 < duration <= LONGEST_S:
+        raise InputError(f"the duration is {duration:g} s; it must be positive, and at most {LONGEST_S:,.0f} s")
 
 
 def check_time_scale(factor: float) -> None:

@@ -63,6 +63,9 @@ def main(arguments: list[str] | None = None) -> int:
         with suppress(OSError):
             print(f"gough: {printable(str(error))}", file=sys.stderr)
         return getattr(error, "exit_status", REFUSED)
+    except MemoryError as error:
+        print(f"gough: there is not enough memory: {error}: choose a shorter duration, or a lower rate", file=sys.stderr)
+        return 1
     except OSError as error:
         # The reader of the output has gone, or its disk is full; nothing more is flushed there.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

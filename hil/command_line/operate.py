@@ -106,6 +106,15 @@ def _text(there: dict[str, Any], home: dict[str, Any]) -> str:
     return pose_text(pose_in(there), pose_in(home))
 
 
+def _speed(option: str, given: float | None, unit: str, factor: float) -> float | None:
+    """A speed in SI units, from an option in others."""
+    if given is None:
+        return None
+    if not 0.0 < given < float("inf"):
+        raise InputError(f"{option} is {given:g} {unit}; it must be a positive number")
+    return factor * given
+
+
 @cli.command(
     cli.argument("point", nargs="?", metavar="POINT", help="home, or a named point of the run, such as park (--points)"),
     cli.argument(
@@ -134,8 +143,8 @@ def gough_move(options: Namespace) -> None:
     if options.relative and options.to is None:
         raise InputError("--relative is for --to: a named point has its own place")
     speeds = {
-        "speed": None if options.speed is None else 1e-3 * options.speed,
-        "turn_speed": None if options.turn_speed is None else radians(options.turn_speed),
+        "speed": _speed("--speed", options.speed, "mm/s", 1e-3),
+        "turn_speed": _speed("--turn-speed", options.turn_speed, "deg/s", radians(1.0)),
     }
 
     def do(operator: Any) -> dict[str, Any]:

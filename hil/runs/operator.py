@@ -15,7 +15,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from hil.runs.config import OPERATOR_CHANNEL
-from hil.runs.operator_messages import MOST_LINE, VERSION, ChannelError, channel_address, decode, encode
+from hil.runs.operator_messages import MOST_LINE, VERSION, ChannelError, channel_address, decode, encode, is_finite
+from plant.errors import InputError
 
 BEAT_S = 0.05
 """Time between the signs of an operator who jogs."""
@@ -100,11 +101,16 @@ class Operator:
         """Make a request, and return its answer.
 
         Raises:
+            InputError: a number is not finite.
             RequestRefusedError: the run does not do it.
             ChannelError: the run has gone.
         """
+        request = {name: value for name, value in what.items() if value is not None}
+        for name, value in request.items():
+            if not is_finite(value):
+                raise InputError(f"{name} is {value}; it must be finite")
         self._number += 1
-        self._send({"id": self._number, "do": do, **{name: value for name, value in what.items() if value is not None}})
+        self._send({"id": self._number, "do": do, **request})
         until = time.monotonic() + self._patience
         while (message := self._line(until)).get("id") != self._number:
             self._keep(message)

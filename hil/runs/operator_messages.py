@@ -45,6 +45,15 @@ def encode(message: Mapping[str, Any]) -> bytes:
     return json.dumps(_plain(message), allow_nan=False).encode() + b"\n"
 
 
+def is_finite(value: Any) -> bool:
+    """Whether all numbers in a part of a message are finite."""
+    if isinstance(value, Mapping):
+        return all(map(is_finite, value.values()))
+    if isinstance(value, list | tuple):
+        return all(map(is_finite, value))
+    return not isinstance(value, float | np.ndarray | np.generic) or bool(np.isfinite(value).all())
+
+
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(name): _plain(each) for name, each in value.items()}

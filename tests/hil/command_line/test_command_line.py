@@ -32,6 +32,22 @@ def refused(run):
     return run.stderr
 
 
+@pytest.mark.parametrize(("option", "unit"), [("--speed", "mm/s"), ("--turn-speed", "deg/s")])
+@pytest.mark.parametrize("value", ["nan", "inf", "-5", "0"])
+def test_a_speed_that_is_none_is_refused_before_anything_moves(option, unit, value, capsys):
+    assert command_line.main(["move", "home", option, value]) == 2
+    assert f"{option} is {value} {unit}; it must be a positive number" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_motion_that_needs_more_memory_than_there_is_is_refused_in_a_line():
+    limited = "import resource, sys; resource.setrlimit(resource.RLIMIT_AS, (3 << 30, 3 << 30)); "
+    limited += "from hil.command_line import main; sys.exit(main(['simulate', '--duration', '1e6']))"
+    run = subprocess.run([sys.executable, "-c", limited], capture_output=True, text=True, check=False)
+    assert run.returncode == 1, run.stderr
+    assert "choose a shorter duration, or a lower rate" in run.stderr and "Traceback" not in run.stderr
+
+
 def test_simulate_prints_a_summary_and_writes_its_figures(tmp_path):
     arguments = ("simulate", "--duration", 1, "--json", "figures.json", "--report", "report.html")
     run = gough_as_users_run_it(*arguments, cwd=tmp_path)

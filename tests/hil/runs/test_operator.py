@@ -215,6 +215,21 @@ def test_what_cannot_be_reached_is_refused_with_the_nearest_pose_which_can(hexap
             operator.step()
 
 
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_number_that_is_not_finite_is_not_sent(hexapod, bad):
+    with running(hexapod) as run, run.operator() as operator:
+        begun(operator)
+        for what in ({"speed": bad}, {"turn_speed": bad}):
+            with pytest.raises(InputError, match=f"{next(iter(what))} is {bad}; it must be finite"):
+                operator.move("home", **what)
+        for where in ({"position": [0.0, bad, 0.0]}, {"rotation": np.array([0.0, bad, 0.0])}):
+            with pytest.raises(InputError, match=r"to is .* it must be finite"):
+                operator.move(where)
+        with pytest.raises(InputError, match=r"translation is .* it must be finite"):
+            operator.step((bad, 0.0, 0.0))
+        assert operator.ask("state")["telemetry"]["moving"] is False
+
+
 def test_a_stop_on_the_way_stays_on_it_and_only_one_move_goes_on_at_a_time(hexapod):
     with running(hexapod) as run, run.operator() as operator:
         begun(operator)
