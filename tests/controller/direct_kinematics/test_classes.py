@@ -273,7 +273,7 @@ def bent_out_of_plane(random, off):
         (bent_out_of_plane, "legs", None),
     ],
 )
-@pytest.mark.parametrize("draws", [3, pytest.param(12, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("draws", [3, pytest.param(12, marks=pytest.mark.endurance)])
 def test_on_the_way_to_a_singularity_there_is_the_pose_or_an_error(approach, method, legs, draws):
     random = np.random.default_rng(13)
     offs = 10.0 ** -np.arange(0.0, 12.5, 0.5)

@@ -48,6 +48,7 @@ def test_a_motion_that_needs_more_memory_than_there_is_is_refused_in_a_line():
     assert "choose a shorter duration, or a lower rate" in run.stderr and "Traceback" not in run.stderr
 
 
+@pytest.mark.slow
 def test_simulate_prints_a_summary_and_writes_its_figures(tmp_path):
     arguments = ("simulate", "--duration", 1, "--json", "figures.json", "--report", "report.html")
     run = gough_as_users_run_it(*arguments, cwd=tmp_path)

@@ -45,6 +45,7 @@ def test_an_fmu_that_needs_a_binding_is_told_so(foreign_fmu: Path, capsys: pytes
     assert "runs in the loop with a binding" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_broken_promise_is_told_by_the_exit_status(
     foreign_fmu: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
