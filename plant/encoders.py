@@ -20,7 +20,7 @@ from typing import Any
 from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries, read_toml, toml_entries
-from plant.imu_disturbances import number_in, words_of_text
+from plant.imu_disturbances import number_in, times_in, words_of_text
 from plant.imu_wiring import PLATFORM_IMU as LEGS
 
 PREFIX = "encoder-"
@@ -183,10 +183,7 @@ def encoder_fault(text: str) -> EncoderFault:
     if kind.size and kind.size not in words:
         raise InputError(f"{title} needs its size: add {kind.size}=NUMBER")
     size = number_in(words, kind.size, title) * kind.factor if kind.size else 0.0
-    duration = number_in(words, "for_s", title, inf)
-    if not duration > 0.0:
-        raise InputError(f"{title} has for_s = {duration:g}; it must be positive")
-    return EncoderFault(kind, _legs(legs, title), size, number_in(words, "at_s", title, -1.0), duration)
+    return EncoderFault(kind, _legs(legs, title), size, *times_in(words, title))
 
 
 def _legs(text: str, title: str) -> tuple[int, ...]:

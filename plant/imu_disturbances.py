@@ -14,6 +14,7 @@ from enum import IntEnum
 from math import inf, isfinite, nan, radians, sqrt
 from typing import Any
 
+from plant.checks import nearest
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries
 from plant.imu_wiring import ALL_IMUS, BASE_IMU
@@ -160,7 +161,8 @@ def disturbance(kind: str, /, **words: Any) -> Disturbance:
     """
     kinds = {each.name.lower(): each for each in DisturbanceKind}
     if kind not in kinds:
-        raise UnknownNameError(f"there is no disturbance {kind!r} of an IMU; there are {', '.join(kinds)}")
+        known = f"{', '.join(kinds)}{nearest(kind, kinds)}"
+        raise UnknownNameError(f"there is no disturbance {kind!r} of an IMU; there are {known}")
     made, title = kinds[kind], f"the disturbance {kind!r}"
     check_entries(words, [word for word in WORDS if word not in ("sensor", "axis")] + [*made.places, *made.sizes], title)
     sizes = [word for word in made.sizes if word in words]
@@ -169,9 +171,7 @@ def disturbance(kind: str, /, **words: Any) -> Disturbance:
     factor, of = _SIZES[sizes[0]] if sizes else (0.0, "")
     size = number_in(words, sizes[0], title) * factor if sizes else 0.0
     course, span, every = course_in(words, title)
-    begin, duration = number_in(words, "at_s", title, -1.0), number_in(words, "for_s", title, inf)
-    if not duration > 0.0:
-        raise InputError(f"{title} has for_s = {duration:g}; it must be positive")
+    begin, duration = times_in(words, title)
     if made == DisturbanceKind.CLOCK and not -1.0 < size <= 100.0:
         raise InputError(f"{title} has size_percent = {100.0 * size:g}; a clock needs more than -100, and at most 10000")
     if made in (DisturbanceKind.JITTER, DisturbanceKind.RANGE) and size < 0.0:
@@ -255,6 +255,16 @@ def number_in(words: Mapping[str, Any], word: str, title: str, default: float = 
     return number
 
 
+def times_in(words: Mapping[str, Any], title: str) -> tuple[float, float]:
+    """When it begins [s], -1 if it is there from the start, and how long it lasts [s]."""
+    begin, duration = number_in(words, "at_s", title, -1.0), number_in(words, "for_s", title, inf)
+    if "at_s" in words and begin < 0.0:
+        raise InputError(f"{title} has at_s = {begin:g}; it must not be negative: leave it out for one from the start")
+    if not duration > 0.0:
+        raise InputError(f"{title} has for_s = {duration:g}; it must be positive")
+    return begin, duration
+
+
 def course_in(words: Mapping[str, Any], title: str) -> tuple[Course, float, float]:
     """The course, its time [s], and the time from pulse to pulse [s]."""
     given = [word for word in _COURSES if word in words]
@@ -286,19 +296,21 @@ def _sensor(words: Mapping[str, Any], of: str, title: str) -> int:
 
 def axis_in(words: Mapping[str, Any], title: str, can_be_all: bool) -> tuple[float, float, float]:
     """The unit vector of `axis`, or ones for all."""
-    axis = words.get("axis")
+    axis, every = words.get("axis"), ", all" if can_be_all else ""
+    possible = f"x, -y, z{every}, or a direction such as 0/0.89/-0.46"
+    if axis is None:
+        raise InputError(f"{title} needs its axis: add {possible}, as in axis=z")
     if axis == "all" and can_be_all:
         return 1.0, 1.0, 1.0
     named = {"x": "1/0/0", "y": "0/1/0", "z": "0/0/1", "-x": "-1/0/0", "-y": "0/-1/0", "-z": "0/0/-1"}
-    parts = named.get(axis, axis).split("/") if isinstance(axis, str) else axis or ()
+    parts = named.get(axis, axis).split("/") if isinstance(axis, str) else axis
     try:
         x, y, z = map(float, parts)
     except (TypeError, ValueError):
         x = y = z = nan
     length = sqrt(x * x + y * y + z * z)
     if not (isfinite(length) and length > 0.0):
-        every = ", all" if can_be_all else ""
-        raise InputError(f"{title} has axis = {axis!r}; it must be x, -y, z{every}, or a direction such as 0/0.89/-0.46")
+        raise InputError(f"{title} has axis = {axis!r}; it must be {possible}")
     return x / length, y / length, z / length
 
 

@@ -25,6 +25,7 @@ from hil.rigs.position_loops import (
     take_motors,
     take_readings,
 )
+from plant.checks import nearest
 from plant.compiled import Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.base_course import BASE_MOTION, MOST_BASE_MOTIONS, BaseMotionKind, base_motion_of_text, placed
 from plant.dynamics.variables import BRAKE, IMU_COUNT, VELOCITY
@@ -33,6 +34,7 @@ from plant.encoder_readings import MOST_FAULTS as MOST_ENCODER_FAULTS
 from plant.encoders import PREFIX as ENCODER_PREFIX
 from plant.encoders import EncoderFaultKind, encoder_fault
 from plant.errors import InputError, UnknownNameError
+from plant.files import check_entries
 from plant.fmu.calls import (
     advance,
     read_base_imu,
@@ -44,7 +46,7 @@ from plant.fmu.calls import (
     write_payload_mass,
 )
 from plant.imu import DISTURBANCE, MOST_DISTURBANCES, disturbance_record, measure
-from plant.imu_disturbances import DisturbanceKind, disturbance, disturbance_of_text
+from plant.imu_disturbances import DisturbanceKind, disturbance, disturbance_of_text, number_in, times_in, words_of_text
 from plant.imu_wiring import BASE_IMU, SLOTS, require_imus
 from plant.mechanism import LEGS, Mechanism
 from plant.truth import TRUTH_SIZE
@@ -89,6 +91,8 @@ class FaultKind(IntEnum):
     PAYLOAD_JUMPS = 0, 5.0, 1.0, "the payload gains this mass [kg]"
 
 
+_OF_A_PROBABILITY = FaultKind.BUS_DROPS, FaultKind.BUS_REORDERS, FaultKind.BUS_REPEATS, FaultKind.BUS_CORRUPTS
+
 FAULT = record_dtype(
     kind=np.int64,  # FaultKind; 0: a disturbance of IMUs alone
     index=np.int64,  # of the IMU or drive
@@ -119,8 +123,7 @@ def fault(text: str, base_imu: bool = True) -> Record:
         UnknownNameError: there is no such kind.
         InputError: an index or a number is out of range, or the fault is of an IMU that is not there.
     """
-    head, *options = text.split(",")
-    name, _, index = head.partition(":")
+    name, index, words = words_of_text(text)
     kinds, disturbances = {kind.label: kind for kind in FaultKind}, [kind.label for kind in DisturbanceKind]
     if name in disturbances:
         meant = disturbance_of_text(text)
@@ -138,8 +141,8 @@ def fault(text: str, base_imu: bool = True) -> Record:
         return _made(0, begin, lasting, base=placed(motion, 0.0))
     if name not in kinds:
         of_encoders = [each.label for each in EncoderFaultKind]
-        known = ", ".join((*kinds, *disturbances, *moves, *of_encoders))
-        raise UnknownNameError(f"there is no fault {name!r}; there are {known}")
+        known = *kinds, *disturbances, *moves, *of_encoders
+        raise UnknownNameError(f"there is no fault {name!r}; there are {', '.join(known)}{nearest(name, known)}")
     kind = kinds[name]
     if kind.count and not (index.isdecimal() and int(index) < kind.count):
         raise InputError(f"the fault {text!r} needs the number of an IMU or drive, 0 to {kind.count - 1}: such as {name}:0")
@@ -147,21 +150,15 @@ def fault(text: str, base_imu: bool = True) -> Record:
         raise InputError(f"the fault {text!r} has a number, but {name} takes none")
     if kind.count == SLOTS:
         require_imus([int(index)], base_imu, f"the fault {text!r}")
-    values = {"at": -1.0, "for": inf, "size": kind.default}
-    for option in options:
-        key, _, value = option.partition("=")
-        try:
-            if key not in values:
-                raise ValueError
-            values[key] = float(value)
-        except ValueError:
-            raise InputError(f"{option!r} in the fault {text!r} is none of at=SECONDS, for=SECONDS, size=NUMBER") from None
-    if not (np.isfinite(values["size"]) and np.isfinite(values["at"]) and values["for"] > 0.0):
-        raise InputError(f"the fault {text!r} has a wrong number: size and at must be finite, for must be positive")
+    title = f"the fault {name!r}"
+    check_entries(words, ("at_s", "for_s", "size"), title)
+    size = number_in(words, "size", title, kind.default)
+    if kind in _OF_A_PROBABILITY and not 0.0 <= size <= 1.0:
+        raise InputError(f"{title} has size = {size:g}; it is a probability: give 0 to 1")
     turned = {}
     if kind == FaultKind.IMU_BIASED:
-        turned = {"disturbance": disturbance_record(disturbance("turn", imus=index, axis="x", size_deg=values["size"]))}
-    return _made(kind, values["at"], values["for"], index=int(index or 0), size=values["size"] * kind.scale, **turned)
+        turned = {"disturbance": disturbance_record(disturbance("turn", imus=index, axis="x", size_deg=size))}
+    return _made(kind, *times_in(words, title), index=int(index or 0), size=size * kind.scale, **turned)
 
 
 def _made(kind: int, at: float, duration: float, **fields: Any) -> Record:

@@ -9,15 +9,16 @@ about its origin.
 
 from collections.abc import Sequence
 from enum import IntEnum
-from math import inf, radians
+from math import radians
 from typing import Any
 
 import numpy as np
 
+from plant.checks import nearest
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.errors import InputError, UnknownNameError
 from plant.files import check_entries
-from plant.imu_disturbances import BASE_PREFIX, WORDS, Course, axis_in, course_in, number_in, words_of_text
+from plant.imu_disturbances import BASE_PREFIX, WORDS, Course, axis_in, course_in, number_in, times_in, words_of_text
 from plant.pose import Array, rotation_from_vector
 
 MOST_BASE_MOTIONS = 8
@@ -77,7 +78,7 @@ def base_motion(kind: str, **words: Any) -> Record:
     """
     kinds = {each.name.lower(): each for each in BaseMotionKind}
     if kind not in kinds:
-        raise UnknownNameError(f"there is no motion {kind!r} of a base; there are {', '.join(kinds)}")
+        raise UnknownNameError(f"there is no motion {kind!r} of a base; there are {', '.join(kinds)}{nearest(kind, kinds)}")
     made, title = kinds[kind], f"the base's {kind}"
     check_entries(words, [word for word in WORDS if word not in ("imus", "sensor")] + [*made.sizes], title)
     sizes = [word for word in made.sizes if word in words]
@@ -86,9 +87,7 @@ def base_motion(kind: str, **words: Any) -> Record:
     size = number_in(words, sizes[0], title) * made.sizes[sizes[0]]
     course, span, every = course_in(words, title)
     rise = {Course.RAMP: span, Course.PULSES: 0.0}.get(course, STEP_S)
-    begin, duration = number_in(words, "at_s", title, -1.0), number_in(words, "for_s", title, inf)
-    if not duration > 0.0:
-        raise InputError(f"{title} has for_s = {duration:g}; it must be positive")
+    begin, duration = times_in(words, title)
     return filled(
         BASE_MOTION, kind=made, course=course, axis=axis_in(words, title, False), size=size, rise=rise, span=span, every=every,
         begin=begin, end=max(begin, 0.0) + duration,

@@ -169,6 +169,7 @@ def test_a_file_that_cannot_be_used_is_refused(tmp_path, content, message):
         ("encoder-slips:3,size_percent=much", "size_percent = 'much'"),
         ("encoder-dead:3,size_mm=1", "size_mm"),
         ("encoder-dead:3,for=0", "for_s = 0; it must be positive"),
+        ("encoder-dead:3,at=-1", "at_s = -1; it must not be negative"),
     ],
 )
 def test_a_fault_that_is_not_meant_so_is_refused(text, message):

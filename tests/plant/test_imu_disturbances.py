@@ -91,7 +91,11 @@ def test_times_are_read_by_both_of_their_names(at, lasting):
         ("imu-offset:all,axis=y", "needs one of size_deg_per_s, size_m_per_s2, size_g, size_ut, and it has none"),
         ("imu-offset:all,axis=y,size_g=1,size_m_per_s2=1", "and it has size_m_per_s2, size_g"),
         ("imu-offset:all,axis=y,size_percent=1", "has no entry 'size_percent'; it has imus, .*, size_ut"),
-        ("imu-offset:all,size_g=1", "has axis = None; it must be x, -y, z, all, or a direction"),
+        (
+            "imu-offset:all,size_g=1",
+            "needs its axis: add x, -y, z, all, or a direction such as 0/0.89/-0.46, as in axis=z",
+        ),
+        ("imu-turn:all,size_deg=1", "needs its axis: add x, -y, z, or a direction"),
         ("imu-offset:all,size_g=1,axis=w", "has axis = 'w'"),
         ("imu-offset:all,size_g=1,axis=0/0/0", "has axis = '0/0/0'"),
         ("imu-offset:all,size_g=1,axis=1/nan/0", "has axis = '1/nan/0'"),
@@ -111,6 +115,7 @@ def test_times_are_read_by_both_of_their_names(at, lasting):
         ("imu-supply:1,size_v=1,sine_hz=0", "has sine_hz = 0; it must be positive, and at most 1e.06"),
         ("imu-supply:1,size_v=1,sine_hz=1e300", "has sine_hz = 1e.300; it must be positive, and at most 1e.06"),
         ("imu-supply:1,size_v=1,for=0", "has for_s = 0; it must be positive"),
+        ("imu-supply:1,size_v=1,at=-5", "has at_s = -5; it must not be negative: leave it out for one from the start"),
         ("imu-supply:1,size_v=1,pulse_ms=30,repeat_hz=50", "has pulses of 30 ms every 20 ms: they must not overlap"),
         ("imu-clock:1,size_percent=-100", "a clock needs more than -100"),
         ("imu-jitter:1,size_ms=-1", "has size_ms = -1; it must not be negative"),
@@ -133,6 +138,8 @@ def test_an_unknown_kind_is_told_with_those_that_there_are():
         UnknownNameError, match="there is no disturbance 'melted' of an IMU; there are offset, scale, vibration"
     ):
         disturbance_of_text("imu-melted:3")
+    with pytest.raises(UnknownNameError, match="did you mean 'offset'"):
+        disturbance_of_text("imu-ofset:3")
     with pytest.raises(InputError, match="needs its kind"):
         disturbance_of_table({"imus": "all"})
 
