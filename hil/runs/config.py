@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from controller.planning import OPERATOR_TARGET, STREAM_TARGET
@@ -81,9 +82,13 @@ def imus_from_text(text: str) -> tuple[int, ...]:
     if text in _NAMED_IMUS:
         return _NAMED_IMUS[text]
     try:
-        return tuple(sorted(set(integers(text))))
+        imus = sorted(integers(text))
     except InputError:
         raise InputError(f"{text!r} is neither all, legs, nor a list of numbers such as 0,2,4,6") from None
+    for before, imu in pairwise(imus):
+        if imu == before:
+            raise InputError(f"{text!r} names IMU {imu} twice: name each IMU once")
+    return tuple(imus)
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def test_options_without_arguments_are_the_configuration_s_defaults(config):
 
 
 def test_options_are_read_in_their_units_and_forms():
-    line = "run --rig udp --no-arm --duration 2 --imus 6,0,2,0 --joint-error 0.1 --magnetometer --cpu 0 --strict --plant p.fmu"
+    line = "run --rig udp --no-arm --duration 2 --imus 6,0,2 --joint-error 0.1 --magnetometer --cpu 0 --strict --plant p.fmu"
     options = parse(line.split())
     config = config_of(options, SimulationConfig)
     assert config == SimulationConfig(

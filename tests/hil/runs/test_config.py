@@ -24,9 +24,14 @@ def test_a_configuration_comes_back_from_its_plain_values():
         SimulationConfig.from_plain(plain | {"colour": "red"})
 
 
-@pytest.mark.parametrize(("text", "imus"), [("all", (0, 1, 2, 3, 4, 5, 6)), ("legs", (0, 1, 2, 3, 4, 5)), ("6,0,0", (0, 6))])
+@pytest.mark.parametrize(("text", "imus"), [("all", (0, 1, 2, 3, 4, 5, 6)), ("legs", (0, 1, 2, 3, 4, 5)), ("6,0", (0, 6))])
 def test_imus_have_names_and_numbers(text, imus):
     assert imus_from_text(text) == imus
+
+
+def test_an_imu_that_is_named_twice_is_refused():
+    with pytest.raises(InputError, match="'0,3,0,1' names IMU 0 twice: name each IMU once"):
+        imus_from_text("0,3,0,1")
 
 
 def test_an_address_without_a_rig_is_refused():
