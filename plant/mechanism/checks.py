@@ -134,15 +134,17 @@ def checked_limits(limits: Mapping[str, Any], legs: int, lengths: Array | None) 
         InputError: an unknown entry, no stroke, a stroke about a missing home, or a home outside the stroke.
     """
     check_entries(limits, sorted(field.name for field in fields(Limits)), "[limits]")
-    shape = f"({legs}, 2)"
+    rows = f"{legs} rows of absolute least and greatest length, in metres"
     if "stroke" not in limits:
-        raise InputError(f"the limits lack the stroke: two numbers in metres about the home lengths, or {shape} lengths")
-    stroke = numbers(limits["stroke"], "stroke", f"(2,) or {shape}")
+        raise InputError(f"the limits lack the stroke: give two numbers about the home lengths, or {rows}")
+    stroke = numbers(limits["stroke"], "stroke", f"(2,) or ({legs}, 2)")
+    if stroke.shape not in ((2,), (legs, 2)):
+        raise InputError(f"stroke is {stroke.tolist()}; it must be two numbers about the home lengths, or {rows}")
     if stroke.shape == (2,):
         if lengths is None:
-            raise InputError(f"a stroke of two numbers counts from the home lengths: give a home pose, or {shape} lengths")
+            raise InputError(f"a stroke of two numbers counts from the home lengths: give a home pose, or {rows}")
         stroke = lengths[:, None] + checked_array(stroke, (2,), "stroke")
-    checked = Limits(**{**limits, "stroke": checked_array(stroke, (legs, 2), "stroke")})
+    checked = Limits(**{**limits, "stroke": stroke})
     if lengths is not None:
         leg = int(np.argmax(np.maximum(checked.stroke[:, 0] - lengths, lengths - checked.stroke[:, 1])))
         least, greatest = checked.stroke[leg]

@@ -277,7 +277,11 @@ ALONG = Mechanism.from_legs(BASE, PLATFORM, home=HOME).home_directions
         ({"home": HOME, "limits": {"stroke": [-0.06, np.nan]}}, r"stroke\[.*1\] is nan"),
         ({"limits": {"stroke": np.tile([-0.1, 0.5], (6, 1))}}, "the stroke of leg 0 runs from -0.1 m to 0.5 m"),
         ({"home": HOME, "limits": {"stroke": [0.01, 0.06]}}, r"leg \d is 0.\d+ m long at home, outside its stroke"),
-        ({"limits": {"stroke": np.ones((3, 2))}}, r"stroke must have shape \(6, 2\), got \(3, 2\)"),
+        (
+            {"limits": {"stroke": np.ones((3, 2))}},
+            r"stroke is \[\[1.0, 1.0\], .*; it must be two numbers about the home lengths, or 6 rows of absolute least",
+        ),
+        ({"home": HOME, "limits": {"stroke": 80}}, "stroke is 80.0; it must be two numbers about the home lengths, or 6 rows"),
         ({"home": HOME, "limits": {"stroke": [-0.1, 0.1], "velocity": 0.0}}, "limit of velocity is 0; it must be positive"),
         ({"home": HOME, "limits": {"stroke": [-0.1, 0.1], "jerk": "fast"}}, "limit of jerk must be .* got 'fast'"),
         ({"home": HOME, "limits": {"stroke": [-0.1, 0.1], "acceleration": np.inf}}, "acceleration is inf"),
