@@ -46,8 +46,9 @@ def load_mechanism(name_or_path: str | Path, changes: Mapping[str, Any] | None =
 
 def mechanism_from_text(text: str, source: str, changes: Mapping[str, Any] | None = None) -> Mechanism | PlanarMechanism:
     """The mechanism of a TOML text, which messages call `source`; changes and errors as for `load_mechanism`."""
+    document = parse_toml(text, source)
     try:
-        document = mechanism_document(text, source)
+        document = _completed(document, source)
         for entry, value in (changes or {}).items():
             set_entry(document, entry, value)
         return mechanism_from_document(document)

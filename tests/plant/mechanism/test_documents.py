@@ -88,7 +88,7 @@ def replaced(old: str, new: str) -> str:
 def test_a_file_that_is_no_mechanism_is_refused(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises((InputError, UnknownNameError), match=message) as caught:
         load_mechanism(write(tmp_path, text))
-    assert "mine.toml" in str(caught.value)
+    assert str(caught.value).count("mine.toml") == 1
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
