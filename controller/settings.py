@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from math import hypot, inf, radians, sqrt
-from typing import TypeVar
+from math import hypot, inf, pi, radians, sqrt
+from typing import ClassVar, TypeVar
 
 from plant.encoders import EncoderModel
 from plant.errors import InputError
@@ -27,13 +27,17 @@ _ZERO_ALLOWED = (
     "integral", "derivative", "position_integral", "sensor_delay", "sensor_timing", "most_lost_imus", "watch_imus",
     "need_platform_imu", "load", "resistance", "friction",
 )  # fmt: skip
+_SWITCHES = "watch_imus", "need_platform_imu"
+_MOST = {"protection_position": (1.0, "m"), "protection_rotation": (pi, "rad")}
 
 S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings", "DriveSettings")
 
 
 @dataclass(frozen=True)
 class _Settings:
-    """Settings that must be positive and finite, except zero or no limit is allowed."""
+    """Settings that must be positive and finite, except zero or no limit is allowed, and switches, which are 0 or 1."""
+
+    table: ClassVar[str]
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -41,19 +45,28 @@ class _Settings:
             endless, zero = field.name in _ENDLESS_ALLOWED, field.name in _ZERO_ALLOWED
             if value == inf and endless:
                 continue
-            if not 0.0 <= value < inf or (value == 0.0 and not zero):
-                raise InputError(f"{field.name} is {value}; it must be {self.allowed(field.name)}")
+            most, _ = _MOST.get(field.name, (inf, ""))
+            switch = field.name in _SWITCHES
+            if not 0.0 <= value < inf or value > most or (value == 0.0 and not zero) or (switch and value not in (0.0, 1.0)):
+                raise InputError(f"[{self.table}] {field.name} is {value}; it must be {self.allowed(field.name)}")
 
     @staticmethod
     def allowed(name: str) -> str:
         """Which values a setting may have, in words."""
+        if name in _SWITCHES:
+            return "0 or 1"
         sign = "0 or positive" if name in _ZERO_ALLOWED else "positive"
+        if name in _MOST:
+            most, unit = _MOST[name]
+            sign += f", in {unit} and at most {most:.3g}"
         return f"{sign}; inf is no limit" if name in _ENDLESS_ALLOWED else f"{sign} and finite"
 
 
 @dataclass(frozen=True)
 class ControlSettings(_Settings):
     """Gains of the six PID controllers, designed by `controller.design.tuning`, and the time at which feedback closes."""
+
+    table = "control"
 
     proportional: float = 60.0  # gain on the deviation of a length [1/s]
     integral: float = 200.0  # gain on its integral [1/s^2]
@@ -79,6 +92,8 @@ class FusionSettings(_Settings):
     The accelerometers' noise is well above the data sheet's: the filters do not estimate bias and scale, which would look like
     motion. Jerk and noise of the whole-mechanism filter are such that its covariance is as large as its errors.
     """
+
+    table = "fusion"
 
     leg_jerk: float = 100.0  # density of the legs' angular jerk [rad/s^3/sqrt(Hz)]
     bias_walk: float = 3.2e-5  # of the gyroscopes' biases [rad/s/sqrt(s)]
@@ -118,6 +133,8 @@ class FusionSettings(_Settings):
 class SafetySettings(_Settings):
     """Limits that are checked while the loop runs."""
 
+    table = "safety"
+
     most_lost_imus: float = 1.0  # so many may be left out at once
     disagreement: float = radians(1.0)  # of an IMU's direction and that of all others, beyond which it is left out [rad]
     misfit: float = 5.0  # RMS of what a pose leaves of the IMUs' directions without the worst, beyond which a run stops [sigma]
@@ -155,6 +172,8 @@ class SafetySettings(_Settings):
 class DriveSettings(_Settings):
     """How far a drive may do otherwise than its model says: what is not known of its load, its motor and its friction."""
 
+    table = "drives"
+
     load: float = 1.0  # unknown load of a leg, as a share of what the legs carry on average
     resistance: float = 0.2  # by which share a winding's resistance may be off
     friction: float = 2.5  # greatest friction, as a multiple of the Coulomb friction in the plant data
@@ -171,17 +190,17 @@ def control_settings(mechanism: Mechanism, **changes: float) -> ControlSettings:
     Raises:
         InputError: an unknown name, or a value that is not a positive number.
     """
-    return _read(ControlSettings, "control", mechanism, changes)
+    return _read(ControlSettings, mechanism, changes)
 
 
 def fusion_settings(mechanism: Mechanism, **changes: float) -> FusionSettings:
     """The fusion settings of a mechanism, as `control_settings`."""
-    return _read(FusionSettings, "fusion", mechanism, changes)
+    return _read(FusionSettings, mechanism, changes)
 
 
 def safety_settings(mechanism: Mechanism, **changes: float) -> SafetySettings:
     """The safety settings of a mechanism, as `control_settings`."""
-    return _read(SafetySettings, "safety", mechanism, changes)
+    return _read(SafetySettings, mechanism, changes)
 
 
 def drive_settings(mechanism: Mechanism, few_imus: bool = False, **changes: float) -> DriveSettings:
@@ -192,7 +211,7 @@ def drive_settings(mechanism: Mechanism, few_imus: bool = False, **changes: floa
     """
     if few_imus and "slack" not in mechanism.settings.get("drives", {}):
         changes = {"slack": _FEW_M, **changes}
-    return _read(DriveSettings, "drives", mechanism, changes)
+    return _read(DriveSettings, mechanism, changes)
 
 
 def sensor_settings(mechanism: Mechanism, imu: ImuModel, encoder: EncoderModel | None = None) -> FusionSettings:
@@ -228,14 +247,14 @@ def sensor_settings(mechanism: Mechanism, imu: ImuModel, encoder: EncoderModel |
 
 def tables_with(name: str) -> list[str]:
     """The tables of settings in a mechanism's file that have an entry of this name."""
-    kinds = {"control": ControlSettings, "fusion": FusionSettings, "safety": SafetySettings, "drives": DriveSettings}
-    return [table for table, kind in kinds.items() if name in (field.name for field in fields(kind))]
+    kinds = ControlSettings, FusionSettings, SafetySettings, DriveSettings
+    return [kind.table for kind in kinds if name in (field.name for field in fields(kind))]
 
 
-def _read(kind: type[S], name: str, mechanism: Mechanism, changes: Mapping[str, float]) -> S:
-    table = {**mechanism.settings.get(name, {}), **changes}
-    check_entries(table, sorted(field.name for field in fields(kind)), f"[{name}]")
+def _read(kind: type[S], mechanism: Mechanism, changes: Mapping[str, float]) -> S:
+    table = {**mechanism.settings.get(kind.table, {}), **changes}
+    check_entries(table, sorted(field.name for field in fields(kind)), f"[{kind.table}]")
     for key, value in table.items():
         if not isinstance(value, int | float) or isinstance(value, bool):
-            raise InputError(f"[{name}] {key} must be a number, got {value!r}")
+            raise InputError(f"[{kind.table}] {key} must be a number, got {value!r}")
     return kind(**table)

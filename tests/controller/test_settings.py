@@ -120,12 +120,41 @@ def test_zero_is_allowed_only_where_it_switches_something_off(hexapod):
 
 
 def test_the_message_tells_whether_zero_is_allowed(hexapod):
-    with pytest.raises(InputError, match=r"most_lost_imus is -1\.0; it must be 0 or positive and finite"):
+    with pytest.raises(InputError, match=r"^\[safety\] most_lost_imus is -1\.0; it must be 0 or positive and finite"):
         safety_settings(hexapod, most_lost_imus=-1.0)
     with pytest.raises(InputError, match=r"carried is 0\.0; it must be positive and finite"):
         safety_settings(hexapod, carried=0.0)
     with pytest.raises(InputError, match=r"evidence is -1\.0; it must be positive; inf is no limit"):
         safety_settings(hexapod, evidence=-1.0)
+
+
+@pytest.mark.parametrize(("kind", "read", "table"), KINDS)
+def test_the_message_names_the_table(hexapod, kind, read, table):
+    name = fields(kind)[0].name
+    with pytest.raises(InputError, match=rf"^\[{table}\] {name} is -60"):
+        read(mechanism_with(hexapod, **{table: {name: -60}}))
+
+
+@pytest.mark.parametrize("name", ["watch_imus", "need_platform_imu"])
+def test_a_switch_is_on_or_off(hexapod, name):
+    for value in (0, 1):
+        assert getattr(safety_settings(hexapod, **{name: value}), name) == value
+    for value in (0.5, 2.0):
+        with pytest.raises(InputError, match=rf"\[safety\] {name} is {value}; it must be 0 or 1"):
+            safety_settings(hexapod, **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "most", "beyond", "allowed"),
+    [
+        ("protection_position", 1.0, 5.0, "positive, in m and at most 1; inf is no limit"),
+        ("protection_rotation", np.pi, 10.0, "positive, in rad and at most 3.14; inf is no limit"),
+    ],
+)
+def test_a_protection_level_that_can_only_be_meant_in_another_unit_is_refused(hexapod, name, most, beyond, allowed):
+    assert getattr(safety_settings(hexapod, **{name: most}), name) == most
+    with pytest.raises(InputError, match=rf"\[safety\] {name} is {beyond}; it must be {allowed}"):
+        safety_settings(hexapod, **{name: beyond})
 
 
 def test_settings_do_not_change_once_built():
