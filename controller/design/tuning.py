@@ -190,9 +190,17 @@ class Design:
         least, _ = RATE_RANGE_HZ
         floor = f"{least:g} Hz, the lowest that there is" if self.lowest_rate == least else f"{self.lowest_rate:.0f} Hz"
         text = f"stable with rates down to {floor}, and {self.hold:.2g} s after the filters have begun"
-        if self.hold > self.gains.hold:
-            text += f", which is more than the {self.gains.hold:g} s of hold in [control]: set it to {_rounded_up(self.hold):g}"
+        if self.longer_hold is not None:
+            text += (
+                f", which is more than the {self.gains.hold:g} s of hold in [control]: it takes hold = {self.longer_hold:g}, "
+                "which --write writes with the gains"
+            )
         return text
+
+    @property
+    def longer_hold(self) -> float | None:
+        """The `hold` that these gains need [s], as it is shown and not below what was found; None if theirs is enough."""
+        return float(np.ceil(100.0 * self.hold - 1e-9) / 100.0) if self.hold > self.gains.hold else None
 
     def rows(self) -> list[tuple[str, str, str]]:
         """Label, value and unit of each figure at home."""
@@ -386,11 +394,6 @@ def _rounded_down(gain: float) -> float:
     return float(np.floor(10.0 * gain) / 10.0)
 
 
-def _rounded_up(time: float) -> float:
-    """A time [s] as it is shown, and not below what was found."""
-    return float(np.ceil(100.0 * time - 1e-9) / 100.0)
-
-
 def lowest_stable_rate(
     mechanism: Mechanism, setup: Setup, gains: ControlSettings, poses: Sequence[Pose], progress: Progress = _silent
 ) -> float:
@@ -467,8 +470,8 @@ def tuned_text(mechanism: str, design: Design) -> str:
         table[prefix + name] = tomlkit.item(getattr(design.gains, name)).comment(comment)
     if not prefix:
         table["derivative"] = design.gains.derivative
-    if design.hold > design.gains.hold:
-        table["hold"] = _rounded_up(design.hold)
+    if design.longer_hold is not None:
+        table["hold"] = design.longer_hold
     return tomlkit.dumps(document)
 
 

@@ -480,7 +480,8 @@ def gough_tune(options: Namespace) -> None:
         table.print()
     print(design.remark)
     if options.write is not None:
-        print(f"written to {options.write}")
+        hold = "" if design.longer_hold is None else f", and hold = {design.longer_hold:g}"
+        print(f"written to {options.write}: these gains{hold}")
 
 
 def tuning_tables(design: "Design") -> list[tuple[str, Table]]:

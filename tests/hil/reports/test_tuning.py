@@ -10,6 +10,7 @@ from controller.design.linear_loop import Setup
 from controller.design.stability import Response, margins
 from controller.design.tuning import Design, PoseMargins, Rule, workspace_poses
 from controller.settings import ControlSettings
+from hil.command_line import main
 from hil.command_line.design import tuning_tables
 from hil.reports.tuning import write_report
 from plant.mechanism import load_in_space
@@ -71,6 +72,15 @@ def test_the_remark_tells_a_hold_that_is_too_short():
     design = replace(design_of("planar-3rpr", 0), hold=0.412)
     assert design.remark == (
         "stable with rates down to 120 Hz, and 0.41 s after the filters have begun, which is more than the 0.2 s of hold in "
-        "[control]: set it to 0.42"
+        "[control]: it takes hold = 0.42, which --write writes with the gains"
     )
     assert "50 Hz, the lowest that there is" in replace(design, lowest_rate=50.0).remark
+
+
+@pytest.mark.parametrize(("hold", "told"), [(0.412, ": these gains, and hold = 0.42"), (0.2, ": these gains")])
+def test_the_command_tells_what_it_wrote(tmp_path, monkeypatch, capsys, hold, told):
+    design, path = replace(design_of("planar-3rpr", 0), hold=hold), tmp_path / "tuned.toml"
+    monkeypatch.setattr("controller.design.tuning.tune", lambda *_: design)
+    assert main(["tune", "--mechanism", "planar-3rpr", "--write", str(path)]) == 0
+    assert capsys.readouterr().out.endswith(f"written to {path}{told}\n")
+    assert ("hold = 0.42" in path.read_text()) == ("hold" in told)
