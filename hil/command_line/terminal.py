@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
 """How each quantile is printed, and its name in the figures."""
 
-_COMPILED_FUNCTIONS = 420
+_COMPILED_FUNCTIONS = 525
 """About how many functions numba compiles for the first simulation on a machine, in two processes."""
 
 _QUIET_S = 10.0
@@ -69,7 +69,8 @@ def progress_bar(label: str) -> Iterator[Callable[..., None]]:
         task, tell = bar.add_task(label, total=None), _told_now_and_then()
 
         def compiling(functions: int) -> None:
-            text = f"compiling function {functions} of about {_COMPILED_FUNCTIONS} (once; the next start takes seconds)"
+            most = max(_COMPILED_FUNCTIONS, functions)
+            text = f"compiling function {functions} of about {most} (once; the next start takes seconds)"
             if not terminal:
                 tell(text)
             # A bar that has reached its end would stand still, and its clock, too.
