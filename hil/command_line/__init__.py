@@ -83,6 +83,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def parse(arguments: list[str]) -> argparse.Namespace:
     """The options of a command line; `run` is the function that carries it out."""
+    arguments = _joined(arguments)
     homes = {name: heading for heading, names in COMMANDS.items() for name in names}
     chosen = next((each for each in arguments if not each.startswith("-")), None)
     parser = _Parser(
@@ -109,6 +110,17 @@ def parse(arguments: list[str]) -> argparse.Namespace:
         flags = re.findall(r"(?<=[\[ ])[-+]{1,2}[a-z][\w-]*", options.parser.format_usage())
         options.parser.error(f"unrecognized arguments: {' '.join(unknown)}{nearest(unknown[0], flags)}")
     return options
+
+
+def _joined(arguments: list[str]) -> list[str]:
+    """The arguments, where numbers such as -10,0,5 stand in one with their option: argparse takes them for an option."""
+    joined: list[str] = []
+    for each in arguments:
+        if joined and re.fullmatch(r"--[a-z][a-z-]*", joined[-1]) and re.fullmatch(r"-[\d.]+(e[-+]?\d+)?,.*", each):
+            joined[-1] += f"={each}"
+        else:
+            joined.append(each)
+    return joined
 
 
 def parser_of(name: str) -> argparse.ArgumentParser:

@@ -73,7 +73,7 @@ def _place(text: str) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if len(numbers) not in (3, 6) or not all(map(isfinite, numbers)):
-        raise ArgumentTypeError(f"{text!r} is no place: give X,Y,Z or X,Y,Z,RX,RY,RZ")
+        raise ArgumentTypeError(f"{text!r} is no place: give X,Y,Z or X,Y,Z,RX,RY,RZ, all of them finite numbers")
     return numbers
 
 
@@ -121,8 +121,7 @@ def _speed(option: str, given: float | None, unit: str, factor: float) -> float 
         "--to",
         type=_place,
         metavar="X,Y,Z[,RX,RY,RZ]",
-        help="in place of a point: position, and rotation vector, as a target in the frame has them [mm, deg]; a place that "
-        "begins with a minus needs --to=-1,2,3",
+        help="in place of a point: position, and rotation vector, as a target in the frame has them [mm, deg]",
     ),
     cli.flag("--relative", "--to is a move from where the platform is, along the frame's axes"),
     cli.argument("--tool", metavar="NAME", help="tool of the run's --frames (default: that of the run)"),

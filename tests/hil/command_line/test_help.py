@@ -94,9 +94,19 @@ def test_options_are_read_in_their_units_and_forms():
     assert config_of(options, RealTimeSettings) == RealTimeSettings(priority=79, cpu=0)
 
 
+@pytest.mark.parametrize("place", ["-10,0,5", "-.5,0,5", "-1e-3,0,5,0,0,-3"])
+def test_numbers_that_begin_with_a_minus_belong_to_the_option_before_them(place):
+    numbers = tuple(map(float, place.split(",")))
+    assert parse(["move", "--to", place, "--speed", "20"]).to == parse(["move", f"--to={place}"]).to == numbers
+    assert parse(["move", "--speed", "-20", "--to", place]).speed == -20.0
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [
+        ("move --to 0,0,nan", "'0,0,nan' is no place: give X,Y,Z or X,Y,Z,RX,RY,RZ, all of them finite numbers"),
+        ("move --to 0,0", "'0,0' is no place: give X,Y,Z"),
+        ("move --to -- -1,0,5", "argument --to: expected one argument"),
         ("simulate --set mass", "argument --set: 'mass' is no setting such as payload.mass=12"),
         ("simulate --imus some", "argument --imus: 'some' is neither all, legs, nor a list of numbers such as 0,2,4,6"),
         ("simulate --joint-error much", "argument --joint-error: invalid float value: 'much'"),
