@@ -127,7 +127,9 @@ def gough_emulate(options: Namespace) -> None:
     keep_to_one_thread()
     from hil.runs.emulator_process import emulate
 
-    config = cli.config_of(options, EmulatorConfig, simulated=cli.config_of(options, SimulationConfig))
+    # The faults are the emulator's, which has other kinds, too.
+    simulated = cli.config_of(options, SimulationConfig, faults=())
+    config = cli.config_of(options, EmulatorConfig, simulated=simulated)
     emulate(config, cli.config_of(options, RealTimeSettings), lambda text: print(text, flush=True))
 
 

@@ -1,6 +1,6 @@
 """Configurations of a simulation, of a run and of an emulator, checked when they are made; quick to load."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -259,8 +259,7 @@ class SimulationConfig:
         self.base_motions  # noqa: B018
         for each in self.disturbances:
             require_imus(each.imus, self.base_imu, f"--fault {each.kind.label}")
-        if self.encoder_faults and self.lengths == NO_LENGTHS:
-            raise InputError("--fault breaks an encoder, and there is none: add --lengths incremental, or leave the fault out")
+        _check_encoders(self.faults, self.lengths)
         if self.base_imu and self.fusion not in FUSIONS_ON_A_MOVING_BASE:
             raise InputError(
                 f"with --base-imu the fusion is one of {', '.join(FUSIONS_ON_A_MOVING_BASE)}, not {self.fusion}: choose one of "
@@ -314,7 +313,7 @@ class SimulationConfig:
     @property
     def encoder_faults(self) -> list[EncoderFault]:
         """What happens to encoders."""
-        return [encoder_fault(text) for text in self.faults if text.startswith(ENCODER_PREFIX)]
+        return _encoder_faults(self.faults)
 
     @property
     def base_motions(self) -> "list[Record]":
@@ -365,6 +364,17 @@ class SimulationConfig:
         return self.operated or self.target == STREAM_TARGET or self.target.startswith(f"{STREAM_TARGET}:")
 
 
+def _encoder_faults(faults: Iterable[str]) -> list[EncoderFault]:
+    """Those of the texts of faults that are of encoders."""
+    return [encoder_fault(text) for text in faults if text.startswith(ENCODER_PREFIX)]
+
+
+def _check_encoders(faults: Iterable[str], lengths: str) -> None:
+    """Check that there are encoders if one has a fault, or raise an `InputError`."""
+    if _encoder_faults(faults) and lengths == NO_LENGTHS:
+        raise InputError("--fault breaks an encoder, and there is none: add --lengths incremental, or leave the fault out")
+
+
 @dataclass(frozen=True)
 class EmulatorConfig:
     """What to emulate; the platform starts at the first pose of the simulated target."""
@@ -386,6 +396,7 @@ class EmulatorConfig:
     def __post_init__(self) -> None:
         if not 0.0 < self.watchdog < 60.0:
             raise InputError(f"the watchdog is {1e3 * self.watchdog:g} ms; it must be more than 0 and less than a minute")
+        _check_encoders(self.faults, self.simulated.lengths)
         if self.bus == "canopen" and self.simulated.drives == POSITION_DRIVES:
             raise InputError(
                 "on canopen the controller sets the drives' mode, as [drives] mode of its settings says: leave --drives out"

@@ -9,7 +9,7 @@ from importlib.metadata import version
 
 import pytest
 
-from hil.command_line import COMMANDS, parse
+from hil.command_line import COMMANDS, main, parse
 from hil.command_line.cli import config_of, options_of
 from hil.realtime.scheduling import RealTimeSettings
 from hil.runs.config import EmulatorConfig, SimulationConfig
@@ -92,6 +92,14 @@ def test_options_are_read_in_their_units_and_forms():
     config = config_of(options, EmulatorConfig)
     assert config.faults == ("dead:1", "noise,at=2") and config.watchdog == 0.04
     assert config_of(options, RealTimeSettings) == RealTimeSettings(priority=79, cpu=0)
+
+
+def test_faults_of_drives_and_bus_go_to_the_emulator_alone(monkeypatch):
+    told = []
+    monkeypatch.setattr("hil.runs.emulator_process.emulate", lambda config, *_: told.append(config))
+    assert main(["emulate", "--fault", "drive-faults:2,at=5", "--fault", "bus-drops", "--rate", "200"]) == 0
+    (config,) = told
+    assert config.faults == ("drive-faults:2,at=5", "bus-drops") and config.simulated == SimulationConfig(rate=200.0)
 
 
 @pytest.mark.parametrize("place", ["-10,0,5", "-.5,0,5", "-1e-3,0,5,0,0,-3"])

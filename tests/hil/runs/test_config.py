@@ -98,6 +98,12 @@ def test_the_emulated_drives_have_one_watchdog():
         EmulatorConfig(watchdog=0.0)
 
 
+def test_a_fault_of_an_encoder_that_an_emulated_rig_lacks_is_refused():
+    with pytest.raises(InputError, match="--fault breaks an encoder, and there is none: add --lengths"):
+        EmulatorConfig(faults=("encoder-dead:2",))
+    assert EmulatorConfig(SimulationConfig(lengths="incremental"), faults=("encoder-dead:2",)).faults == ("encoder-dead:2",)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
