@@ -642,7 +642,7 @@ def test_a_file_describes_a_kind_of_imu_in_words_with_units(tmp_path: Path) -> N
         ("[accelerometer]\nreach_m_per_s2 = 'far'", "is 'far'; it must be a number"),
         ("sample_rate_hz = -1", "the sample_rate of an IMU is -1.0"),
         ("clock_error_percent = 100", "its clock_error below 1"),
-        ("[[disturbances]]\nkind = 'turn'\nimus = 3\nsize_deg = 1", "has axis = None"),
+        ("[[disturbances]]\nkind = 'turn'\nimus = 3\nsize_deg = 1", "needs its axis: add x, -y, z, or a direction"),
         ("based_on = 'mpu6050'", "no IMU preset 'mpu6050'"),
         ("sample_rate_hz", "is not valid TOML"),
     ],
