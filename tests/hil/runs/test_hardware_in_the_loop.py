@@ -136,16 +136,17 @@ def test_over_udp_it_follows_as_with_the_plant_itself_and_says_how_the_bus_was(t
 
 @pytest.mark.slow
 def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
-    """IMUs whose node waits for a processor are left out for a while; what is checked holds nevertheless.
+    """IMUs whose node waits for a processor are left out for a while; what is checked holds nevertheless. At 125 Hz they may
+    wait for twice as long as at 250.
 
     On a busy machine all of them may wait at once, which ends a run as it should. Then there is another.
     """
     patient = tmp_path / "patient.toml"
     patient.write_text(Path(PATIENT[-1]).read_text() + "most_lost_imus = 4\nneed_platform_imu = 0\n")
-    for _ in range(3):
+    for _ in range(6):
         with emulated("--bus", "canopen", at=str(canopen_file)) as (_, at, _):
             run = gough(
-                "run", "--rig", "canopen", "--rig-at", at, "--target", "sines", "--rate", 250, *PATIENT[:-1], patient,
+                "run", "--rig", "canopen", "--rig-at", at, "--target", "sines", "--rate", 125, *PATIENT[:-1], patient,
                 "--duration", 4, "--record", tmp_path / "can.mcap", "--json", tmp_path / "can.json",
             )  # fmt: skip
             status, _, errors = finished(run)
@@ -156,7 +157,7 @@ def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
     assert status == 0, errors
     figures = json.loads((tmp_path / "can.json").read_text())
     assert len(figures["identity"]["parts"]) == 13
-    assert figures["errors_m"]["known"] > 900
+    assert figures["errors_m"]["known"] > 450
     assert figures["errors_m"]["estimation"] < 2e-3
     assert figures["errors_m"]["tracking"] < 1e-3
     records = read(tmp_path / "can.mcap").records
