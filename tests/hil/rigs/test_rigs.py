@@ -50,11 +50,11 @@ FOLLOWED = ("reference", "command", "mode", "stop", "request")
 
 
 def findings_between_processes(*rigs, **more):
-    """What an examination finds in each of three trials; exchanges that take longer than their period are the machine's doing.
+    """What an examination finds in each of six trials; exchanges that take longer than their period are the machine's doing.
 
-    A loaded machine may hold an emulator up in one trial. A rig that breaks the contract breaks it in all three.
+    A loaded machine may hold an emulator up in some. A rig that breaks the contract breaks it in all.
     """
-    for _ in range(3):
+    for _ in range(6):
         found = examine_rig(*rigs, **more)
         texts = [text for clause, texts in found.findings.items() if clause != "period" for text in texts]
         if not texts:
