@@ -51,7 +51,7 @@ def is_finite(value: Any) -> bool:
         return all(map(is_finite, value.values()))
     if isinstance(value, list | tuple):
         return all(map(is_finite, value))
-    return not isinstance(value, float | np.ndarray | np.generic) or bool(np.isfinite(value).all())
+    return not isinstance(value, float | np.number | np.ndarray) or bool(np.isfinite(value).all())
 
 
 def _plain(value: Any) -> Any:
