@@ -20,6 +20,9 @@ _SAY_NOTHING = (
 )  # fmt: skip
 _MOST_EVENTS = 12
 
+_MOST_LOST = 10
+"""More frames in a row are not lost: with a fifth of them lost, so many are in one of ten million cases."""
+
 
 def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate: float) -> dict[str, Any]:
     """The figures of a run, in SI units; None where there is nothing to measure.
@@ -99,7 +102,8 @@ def _true_poses(records: Record) -> tuple[Array, Array]:
     """Positions (N, 3) [m] and rotations (N, 3, 3).
 
     While the rig does not answer, the truth in the records is that of its last answer. Its drives go on at their last speed,
-    and so does the pose here.
+    and so does the pose here. On CAN the truth has a frame of its own. Where that was lost, the truth is that of an earlier
+    cycle, and the pose here is between those of the frames before and after.
     """
     positions = records["truth"][:, TRUTH_POSITION].copy()
     rotations = rotations_from_quaternions(np.ascontiguousarray(records["truth"][:, TRUTH_QUATERNION]))
@@ -111,7 +115,27 @@ def _true_poses(records: Record) -> tuple[Array, Array]:
             turn = vector_from_rotation(rotations[cycle - 1] @ rotations[cycle - 2].T) / periods[cycle - 1]
         positions[cycle] = positions[cycle - 1] + periods[cycle] * shift
         rotations[cycle] = rotation_from_vector(periods[cycle] * turn) @ rotations[cycle - 1]
+    periods_until = np.cumsum(periods)
+    for before, after in _lost_frames(records):
+        whole_turn = vector_from_rotation(rotations[after] @ rotations[before].T)
+        for cycle in range(before + 1, after):
+            share = (periods_until[cycle] - periods_until[before]) / (periods_until[after] - periods_until[before])
+            positions[cycle] = positions[before] + share * (positions[after] - positions[before])
+            rotations[cycle] = rotation_from_vector(share * whole_turn) @ rotations[before]
     return positions, rotations
+
+
+def _lost_frames(records: Record) -> list[tuple[int, int]]:
+    """The last cycle before and the first one after each gap in which the rig has answered and the truth did not change.
+
+    Where it did not change for longer, the platform stands.
+    """
+    changes = np.flatnonzero((np.diff(records["truth"], axis=0) != 0.0).any(axis=1) | (records["silent"][1:] > 0)) + 1
+    return [
+        (before, after)
+        for before, after in zip(changes[:-1].tolist(), changes[1:].tolist(), strict=True)
+        if 1 < after - before <= _MOST_LOST + 1 and records["silent"][before] == records["silent"][after] == 0
+    ]
 
 
 def _encoder_off(records: Record, begin: int, told_at: int) -> float | None:

@@ -14,7 +14,7 @@ The 8 is for faults that grow: such a fault is larger at the end of the filter's
 the pose before, and goes on until the next evaluation. A fault since the loop began has had little time to move the pose: these
 terms grow over the first four seconds.
 
-The level is the root of the sum of the squares of seven terms:
+The level is the root of the sum of the squares of eight terms:
 
 1. The greatest of these.
 2. The standard deviation of the pose, both that of the closed form and that of the pose's own source if that is less: no filter
@@ -26,8 +26,10 @@ The level is the root of the sum of the squares of seven terms:
 6. How far the pose has moved otherwise than commanded within a second, as `commanded` has it: so errors that all IMUs share
    show themselves before there is evidence.
 7. How far the pose in closed form and that of the whole-mechanism filter are from each other.
+8. How far the pose has drifted from the one that gravity shows, as `gravity` has it: so errors that all gyroscopes share show
+   themselves while the filters still take them for motion.
 
-Terms 3 to 7 are renewed in every cycle; term 6 is that of the cycle before.
+Terms 3 to 8 are renewed in every cycle; term 6 is that of the cycle before, and term 8 changes with the fault filter's windows.
 """
 
 import numpy as np
@@ -71,11 +73,14 @@ vibration's RMS that counts with them.
 _BY_FORCE = 0.04, 0.06
 """How far such a force moves the pose [m, rad per m/s^2]: legs of 0.4 m that lean by its share of gravity."""
 
-_USUALLY_MOVED, _OF_MOVED = (1.5e-4, 1.5e-3), 1.8
+_USUALLY_MOVED, _OF_MOVED = (1.5e-4, 1.5e-3), (2.2, 1.8)
 """Motion that was not commanded counts beyond the first [m, rad], so many times."""
 
 _USUALLY_APART, _OF_APART = (5e-4, 2e-3), 0.8
 """The distance of the two estimates counts beyond the first [m, rad], so many times."""
+
+_USUALLY_DRIFTED, _OF_DRIFTED = (0.4, 1.0), 2.0
+"""The drift from what gravity shows counts beyond so many standard deviations of the closed form, so many times."""
 
 STATE = record_dtype(
     level=(np.float64, 2),  # of position [m] and rotation [rad]
@@ -184,7 +189,8 @@ def end_level(s: Record, age: float) -> None:
 
 @kernel
 def publish_level(
-    s: Record, misfit: float, duration: float, steady: float, shaken: float, bent: Array, moved: Array, apart: Array
+    s: Record, misfit: float, duration: float, steady: float, shaken: float, bent: Array, moved: Array, apart: Array,
+    drifted: Array,
 ) -> None:  # fmt: skip
     """Publish the level of a cycle, with what has come up since the last evaluation.
 
@@ -197,12 +203,14 @@ def publish_level(
         bent: (2,), by how much an encoder could move position [m] and rotation [rad] unseen.
         moved: (2,), by how much they have moved otherwise than commanded, `commanded.STATE`.
         apart: (2,), how far the closed form and the filter that is trusted are from each other.
+        drifted: (2,), how far they have drifted from what gravity shows, `gravity.STATE`.
     """
     s.misfit += min(1.0, duration / _MISFIT_S) * (misfit - s.misfit)
     beyond = _OF_MISFIT**2 * max(s.misfit - _USUAL_MISFIT, 0.0)
     force = min(max(steady - _SOUND, 0.0) + _SHAKEN * np.sqrt(shaken), _MOST)
     for part in range(2):
         squared = s.evaluated[part] + beyond * s.closed[part] + (_BY_FORCE[part] * force) ** 2 + bent[part] ** 2
-        squared += (_OF_MOVED * max(moved[part] - _USUALLY_MOVED[part], 0.0)) ** 2
+        squared += (_OF_MOVED[part] * max(moved[part] - _USUALLY_MOVED[part], 0.0)) ** 2
         squared += (_OF_APART * max(apart[part] - _USUALLY_APART[part], 0.0)) ** 2
+        squared += (_OF_DRIFTED * max(drifted[part] - _USUALLY_DRIFTED[part] * np.sqrt(s.closed[part]), 0.0)) ** 2
         s.level[part] = np.sqrt(squared)

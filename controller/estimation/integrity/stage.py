@@ -4,7 +4,7 @@ every hypothesis.
 
 import numpy as np
 
-from controller.estimation.integrity import commanded, evidence, fault_filter, hypotheses, parity, protection
+from controller.estimation.integrity import commanded, evidence, fault_filter, gravity, hypotheses, parity, protection
 from controller.estimation.integrity.hypotheses import (
     HYPOTHESES,
     OF_ONE_IMU,
@@ -36,6 +36,7 @@ STATE = record_dtype(
     hypotheses=hypotheses.SCRATCH,
     protection=protection.STATE,
     commanded=commanded.STATE,
+    gravity=gravity.STATE,
     parity=parity.STATE,
     compared=np.int64,  # the last window of which the gyroscopes have been compared
     contradicts=np.int64,  # whether they contradict each other, or accelerometers show no motion, found in this cycle
@@ -131,6 +132,8 @@ def step_integrity(
     if time.missed > 0 and not fault_filter.bridge_gap(p.filter, s.filter, time.missed):
         restart_integrity(p, s)
     took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, pose, legs, commands)
+    if took:
+        gravity.compare_with_gravity(s.gravity, s.filter, imus.excluded, s.commanded.following != 0)
     if s.filter.job > 0 and s.compared != s.filter.windows:
         s.compared = s.filter.windows
         s.contradicts = s.filter.windows > 0 and (
@@ -141,7 +144,7 @@ def step_integrity(
     if s.evaluations > 0:
         protection.publish_level(
             s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max(), pose.bent,
-            s.commanded.moved, pose.apart,
+            s.commanded.moved, pose.apart, s.gravity.drifted,
         )  # fmt: skip
     if s.waits > 0:
         s.waits -= 1

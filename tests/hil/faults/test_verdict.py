@@ -58,8 +58,8 @@ def test_errors_are_told_apart_by_the_moment_at_which_something_is_told():
     assert found["cycles"] == 330 and not found["forbidden"] and "covered" not in found
 
 
-def test_while_the_rig_is_silent_the_platform_goes_on_at_its_last_speed():
-    """The records then have the truth of the last answer."""
+def moving_exactly():
+    """The platform goes at 20 mm/s and turns by 10 deg/s, and the estimate is right."""
     made = records()
     times = np.arange(CYCLES) / RATE
     made["truth"][:, 0] = made["position"][:, 0] = 0.02 * times
@@ -67,12 +67,34 @@ def test_while_the_rig_is_silent_the_platform_goes_on_at_its_last_speed():
     made["truth"][:, 3], made["truth"][:, 6] = np.cos(half), np.sin(half)
     made["rotation"] = rotations_from_quaternions(np.ascontiguousarray(made["truth"][:, 3:7]))
     made["position"][:, 2] = 0.0
+    return made
+
+
+def test_while_the_rig_is_silent_the_platform_goes_on_at_its_last_speed():
+    """The records then have the truth of the last answer."""
+    made = moving_exactly()
     made["truth"][200:230] = made["truth"][199]
     made["silent"][200:230] = np.arange(1, 31)
     found = judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)
     assert found["position_before"] < 1e-12 and found["rotation_before"] < 1e-6
     made["position"][215, 0] += 1e-3
     assert judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)["position_before"] == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("lost", [1, 2, 10])
+def test_where_a_frame_with_the_truth_was_lost_the_platform_was_between_those_before_and_after(lost):
+    made = moving_exactly()
+    made["truth"][200 : 200 + lost] = made["truth"][199]
+    found = judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)
+    assert found["position_before"] < 1e-12 and found["rotation_before"] < 1e-6
+
+
+def test_where_the_truth_does_not_change_for_longer_the_platform_stands():
+    made = moving_exactly()
+    made["truth"][200:211] = made["truth"][199]
+    found = judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)
+    assert found["position_before"] == pytest.approx(11 * 0.02 / RATE)
+    assert found["rotation_before"] == pytest.approx(np.radians(11 * 10.0 / RATE))
 
 
 def test_an_encoder_is_as_far_off_as_its_reading_changes_otherwise_than_its_length():

@@ -49,14 +49,15 @@ def constants(mechanism, **changes):
     return parameters, state
 
 
-def filtered(mechanism, r, parameters, state, off=(0.0,) * 6, count=None, missed=None):
-    """Run the fault filter over readings, around poses that are `off` (6,) the true ones [m, rad]; returns how many windows.
+def filtered(mechanism, r, parameters, state, off=(0.0,) * 6, count=None, missed=None, then=lambda: None):
+    """Run the fault filter over readings, around poses that are `off` (6,) or (N, 6) the true ones [m, rad]; returns how many
+    windows.
 
-    `missed` says by number before which samples how many others are missed.
+    `missed` says by number before which samples how many others are missed; `then` is called after each window.
     """
     p, s = parameters[()], state[()]
     taken = gap = 0
-    turn = rotation_from_vector(np.array(off[3:]))
+    offs = np.broadcast_to(off, (len(r.samples), 6))
     gaps = missed or {}
     lost = {k for i, n in gaps.items() for k in range(i - n, i)}
     for i in range(len(r.samples) if count is None else count):
@@ -64,7 +65,8 @@ def filtered(mechanism, r, parameters, state, off=(0.0,) * 6, count=None, missed
             gap += 1
             continue
         s["imus"]["sample"] = r.samples[i]
-        s["pose"]["position"], s["pose"]["rotation"] = r.positions[i] + off[:3], turn @ r.rotations[i]
+        s["pose"]["position"] = r.positions[i] + offs[i, :3]
+        s["pose"]["rotation"] = rotation_from_vector(offs[i, 3:].copy()) @ r.rotations[i]
         place_legs(mechanism, s["pose"])
         s["reference"]["motion"] = r.legs[i]
         f = s["integrity"]["filter"]
@@ -72,9 +74,12 @@ def filtered(mechanism, r, parameters, state, off=(0.0,) * 6, count=None, missed
         if gap > 0 and not bridge_gap(p["integrity"]["filter"], f, gap):
             begin_anew(f)
         gap = 0
-        taken += step_fault_filter(
+        took = step_fault_filter(
             p["integrity"]["filter"], f, p["rig"]["sensors"], s["imus"], s["pose"], legs, legs[:, 1].copy()
         )  # fmt: skip
+        taken += took
+        if took:
+            then()
     return taken
 
 

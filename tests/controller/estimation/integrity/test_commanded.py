@@ -166,4 +166,4 @@ def test_drives_and_loads_that_are_not_as_the_file_says_raise_the_level_by_milli
         simulate(replace(config, settings=each)).summary()["protection"]["position_max"]
         for each in ((), (Setting.parse(setting),))
     )
-    assert usual < other < usual + 3e-3
+    assert usual < other < usual + 3.5e-3

@@ -14,11 +14,11 @@ OWN = np.array([np.diag([4e-8, 1e-8, 9e-8, 1e-6, 4e-6, 1e-6]), np.diag([1e-8, 2e
 NOT = (0.0, 0.0)
 
 
-def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, apart=NOT):
+def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, apart=NOT, drifted=NOT):
     """The level (2,) at the end of an evaluation, with a misfit that lasts."""
     level["covariance"], level["misfit"] = own, misfit
     end_level(level[()], age)
-    publish_level(level[()], misfit, 0.01, steady, shaken, *(np.array(each) for each in (bent, moved, apart)))
+    publish_level(level[()], misfit, 0.01, steady, shaken, *(np.array(each) for each in (bent, moved, apart, drifted)))
     return level["level"].copy()
 
 
@@ -113,8 +113,17 @@ def test_what_was_not_commanded_and_two_estimates_that_are_apart_raise_the_level
     level["determined"] = 1
     sound = ended(level)
     np.testing.assert_array_equal(ended(level, moved=(1.5e-4, 1.5e-3), apart=(5e-4, 2e-3)), sound)
-    np.testing.assert_allclose(ended(level, moved=(1.15e-3, 3.5e-3)), np.hypot(sound, [1.8e-3, 3.6e-3]))
+    np.testing.assert_allclose(ended(level, moved=(1.15e-3, 3.5e-3)), np.hypot(sound, [2.2e-3, 3.6e-3]))
     np.testing.assert_allclose(ended(level, apart=(1.5e-3, 12e-3)), np.hypot(sound, [0.8e-3, 8e-3]))
+
+
+def test_a_drift_from_what_gravity_shows_raises_the_level_beyond_what_calibrations_leave():
+    _, state = evaluated()
+    level = state["integrity"]["protection"]
+    level["determined"] = 1
+    sound, usual = ended(level), np.array([0.4, 1.0]) * np.sqrt(next(iter(traces())))
+    np.testing.assert_allclose(ended(level, drifted=0.999 * usual), sound, rtol=1e-12)
+    np.testing.assert_allclose(ended(level, drifted=usual + [1e-3, 2e-3]), np.hypot(sound, [2e-3, 4e-3]))
 
 
 def test_measurements_that_contradict_each_other_raise_the_level_between_evaluations():
@@ -126,7 +135,7 @@ def test_measurements_that_contradict_each_other_raise_the_level_between_evaluat
     np.testing.assert_allclose(ended(level, misfit=2.3), np.sqrt(calm**2 + 1.6**2 * 2.0 * closed))
     # A misfit that has just come up counts by its share of the average.
     level["misfit"] = 0.3
-    publish_level(level[()], 2.3, 0.01, 0.0, 0.0, np.zeros(2), np.zeros(2), np.zeros(2))
+    publish_level(level[()], 2.3, 0.01, 0.0, 0.0, *np.zeros((4, 2)))
     np.testing.assert_allclose(level["level"], np.sqrt(calm**2 + 1.6**2 * 0.2 * closed))
     assert np.isinf(ended(level, own=np.full_like(OWN, np.inf), misfit=2.3)).all()
 
