@@ -79,7 +79,7 @@ _USUALLY_MOVED, _OF_MOVED = (1.5e-4, 1.5e-3), (2.2, 1.8)
 _USUALLY_APART, _OF_APART = (5e-4, 2e-3), 0.8
 """The distance of the two estimates counts beyond the first [m, rad], so many times."""
 
-_USUALLY_DRIFTED, _OF_DRIFTED = (0.4, 1.0), 2.0
+_USUALLY_DRIFTED, _OF_DRIFTED = (0.3, 0.7), (3.0, 2.5)
 """The drift from what gravity shows counts beyond so many standard deviations of the closed form, so many times."""
 
 STATE = record_dtype(
@@ -212,5 +212,5 @@ def publish_level(
         squared = s.evaluated[part] + beyond * s.closed[part] + (_BY_FORCE[part] * force) ** 2 + bent[part] ** 2
         squared += (_OF_MOVED[part] * max(moved[part] - _USUALLY_MOVED[part], 0.0)) ** 2
         squared += (_OF_APART * max(apart[part] - _USUALLY_APART[part], 0.0)) ** 2
-        squared += (_OF_DRIFTED * max(drifted[part] - _USUALLY_DRIFTED[part] * np.sqrt(s.closed[part]), 0.0)) ** 2
+        squared += (_OF_DRIFTED[part] * max(drifted[part] - _USUALLY_DRIFTED[part] * np.sqrt(s.closed[part]), 0.0)) ** 2
         s.level[part] = np.sqrt(squared)
