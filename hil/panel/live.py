@@ -18,6 +18,7 @@ from hil.panel.scene import Machine, Scene
 from hil.realtime.scheduling import processor_left
 from hil.runs.operator import Operator, RequestRefusedError
 from hil.runs.operator_messages import RUN_ENDED, ChannelError
+from hil.runs.run_state import event_line
 
 _EVENTS = 8
 _LISTEN_S = 0.05
@@ -145,7 +146,8 @@ class LivePanel:
         events = self._watching.events
         while events:
             event = events.popleft()
-            self._events.append(f"cycle {event['cycle']}: {event['event']}" if "cycle" in event else str(event["event"]))
+            told = str(event["event"])
+            self._events.append(event_line(event["cycle"], event["time"], told) if "cycle" in event else told)
 
     def _show(self, state: dict[str, Any], last: bool) -> None:
         with self._server.atomic():

@@ -324,7 +324,7 @@ def _of_recording(source: str, run: RecordedRun) -> _Loaded:
     times = run.times[run.motion]
     if len(times) < 2:
         raise InputError(f"{source} has no motion: the run ended before it began; leave it out")
-    state = RunState()
+    state = RunState(run.period)
     state.add(run.records)
     figures = _with_the_hold(state.errors(), state.rotation_errors())
     # Those that the JSON of a run has; a recording also tells each missed period.

@@ -13,7 +13,7 @@ from plant.encoders import NO_LENGTHS, EncoderFault, encoder_fault
 from plant.encoders import PREFIX as ENCODER_PREFIX
 from plant.errors import InputError, UnknownNameError
 from plant.fmu.settings import Setting
-from plant.imu_disturbances import BASE_PREFIX, Disturbance, disturbance_of_text
+from plant.imu_disturbances import BASE_PREFIX, Disturbance, disturbance_of_text, times_in, words_of_text
 from plant.imu_wiring import ALL_IMUS, RIGHT_WIRING, Wiring, require_imus
 
 if TYPE_CHECKING:
@@ -260,6 +260,10 @@ class SimulationConfig:
         for each in self.disturbances:
             require_imus(each.imus, self.base_imu, f"--fault {each.kind.label}")
         _check_encoders(self.faults, self.lengths)
+        for text in self.faults:
+            begin, _ = times_in(words_of_text(text)[2], f"the fault {text!r}")
+            if begin >= self.duration:
+                raise InputError(f"--fault {text} begins at {begin:g} s, when the motion of {self.duration:g} s is over")
         if self.base_imu and self.fusion not in FUSIONS_ON_A_MOVING_BASE:
             raise InputError(
                 f"with --base-imu the fusion is one of {', '.join(FUSIONS_ON_A_MOVING_BASE)}, not {self.fusion}: choose one of "

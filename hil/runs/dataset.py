@@ -15,6 +15,7 @@ from controller.safety.causes import Mode
 from hil.loop.records import STAGES
 from hil.recording.mcap import events_of
 from hil.runs.recorded_run import recorded_run
+from hil.runs.run_state import event_line
 from hil.runs.simulation import SimulationResult
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
@@ -186,7 +187,11 @@ def _attributes(config: dict[str, Any], mechanism: Mechanism, records: Record) -
         "mechanism": mechanism.name,
         "config": json.dumps(config),
         "version": config.get("version", version("gough")),
-        "events": [f"cycle {each['cycle']}: {text}" for each in eventful for text in events_of(each)],
+        "events": [
+            event_line(int(each["cycle"]), int(each["cycle"]) / float(config["rate"]), text)
+            for each in eventful
+            for text in events_of(each)
+        ],
     }
 
 

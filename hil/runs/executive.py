@@ -110,7 +110,7 @@ def run(
     records = shared_array(max(_LEAST_RECORDS, round(_BUFFER_S * config.rate)), RECORD)
     link: NDArray[np.int64] = shared_array(LINK_SIZE, np.dtype(np.int64))
     link[Link.SUPERVISOR] = os.getpid()
-    state = RunState(frames=config.active_frames)
+    state = RunState(1.0 / config.rate, frames=config.active_frames)
     allowed, kept = os.sched_getaffinity(0), settings.kept_processor
     with _asked_to_stop(link), claimed(recording), processor_left(kept), contextlib.ExitStack() as at_end:
         stream: Record | None = shared_array(1, STREAM).reshape(()) if config.streamed else None

@@ -394,7 +394,8 @@ class _Channel:
             self._platform.end(Cause(int(self._latest["stop"])).short)
         for eventful in records[records["event_count"] > 0]:
             for text in events_of(eventful):
-                self._tell({"event": text, "cycle": int(eventful["cycle"])})
+                cycle = int(eventful["cycle"])
+                self._tell({"event": text, "cycle": cycle, "time": cycle * self._period})
 
     def _telemetry(self) -> dict[str, Any]:
         """What the run does now, in SI units."""

@@ -16,6 +16,7 @@ from controller.safety.causes import Mode
 from controller.workspace import Demands
 from hil.recording.mcap import Recording, read_run
 from hil.runs.operator_messages import pose_message
+from hil.runs.run_state import event_line
 from hil.runs.telemetry import estimated_pose, margins_message, reference_pose, state_message, timing_message
 from plant.compiled import Record
 from plant.errors import GoughError, InputError
@@ -127,7 +128,7 @@ class RecordedRun:
     def told(self, index: int) -> list[str]:
         """The last events until a record."""
         cycle = int(self.records["cycle"][index])
-        return [f"cycle {at}: {text}" for at, text in self.events if at <= cycle][-_EVENTS:]
+        return [event_line(at, at * self.period, text) for at, text in self.events if at <= cycle][-_EVENTS:]
 
 
 def recorded_run(paths: Sequence[Path], mechanism: str | None = None) -> RecordedRun:

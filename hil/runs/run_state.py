@@ -17,12 +17,18 @@ from plant.truth import TRUTH_POSITION, TRUTH_QUATERNION, pose_known
 _MOST_EVENTS = 100
 
 
-def note_events(records: Record, noted: list[str]) -> None:
-    """Add the events in these records to those that are noted: cycle and words."""
+def event_line(cycle: int, seconds: float, text: str) -> str:
+    """An event with its cycle, and its time since the first cycle."""
+    return f"cycle {cycle} ({seconds:.3f} s): {text}"
+
+
+def note_events(records: Record, period: float, noted: list[str]) -> None:
+    """Add the events in these records to those that are noted, as lines; the period is in seconds."""
     for eventful in records[records["event_count"] > 0]:
+        cycle = int(eventful["cycle"])
         for text in events_of(eventful):
             if len(noted) < _MOST_EVENTS:
-                noted.append(f"cycle {eventful['cycle']}: {text}")
+                noted.append(event_line(cycle, cycle * period, text))
             elif len(noted) == _MOST_EVENTS:
                 noted.append("later events are not listed")
 
@@ -32,6 +38,7 @@ class RunState:
     """State and figures of a run until now.
 
     Attributes:
+        period: of a cycle [s].
         latest: the last record of the loop, dtype `RECORD`.
         timing: the durations of its stages.
         missed: number of periods missed.
@@ -39,11 +46,12 @@ class RunState:
         refused: what the machine refused of the measures for real time.
         refused_packets: number of packets that a rig on a bus refused.
         unseen: number of cycles that were overwritten before the supervisor saw them; no figure includes them.
-        events: the loop's, by cycle, and the supervisor's own.
+        events: the loop's, as from `event_line`, and the supervisor's own.
         protection: the greatest protection level (2,) of the motion [m, rad]; NaN until there is one.
         frames: of the read-outs, if the run has any.
     """
 
+    period: float
     latest: Record | None = None
     timing: Timing = field(default_factory=Timing)
     missed: int = 0
@@ -75,7 +83,7 @@ class RunState:
         self.missed += int(records["missed"].sum())
         self.late += int((records["silent"] > 0).sum())
         self.refused_packets = int(records["refused"][-1])
-        note_events(records, self.events)
+        note_events(records, self.period, self.events)
         moving = records["mode"] == Mode.RUNNING
         if moving.any():
             self.protection = np.fmax(self.protection, np.fmax.reduce(records["protection"][moving].astype(float)))

@@ -132,7 +132,7 @@ class SimulationResult:
     def events(self) -> list[str]:
         """What happened, by cycle: the first hundred events."""
         noted: list[str] = []
-        note_events(self.records, noted)
+        note_events(self.records, 1.0 / self.config.rate, noted)
         return noted
 
     def summary(self) -> dict[str, Any]:

@@ -4,6 +4,7 @@ This module replaces parts of numba while a kernel compiles.
 """
 
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
@@ -153,21 +154,30 @@ def flat_linking() -> Iterator[None]:
 
 @contextmanager
 def _ctrl_c_kept() -> Iterator[None]:
-    """Let no Ctrl-C be lost: its exception ends in the function that LLVM calls back, so it is raised once more."""
+    """Let no Ctrl-C be lost: its exception ends in the function that LLVM calls back, so it is raised once more. Python reports
+    the first one as ignored, with a traceback, which is left out.
+    """
     before, main = signal.getsignal(signal.SIGINT), threading.current_thread() is threading.main_thread()
     if not main or before is not signal.default_int_handler:
         yield
         return
     pressed: list[int] = []
+    report = sys.unraisablehook
+
+    def report_others(unraisable: "sys.UnraisableHookArgs") -> None:
+        if unraisable.exc_type is not KeyboardInterrupt:
+            report(unraisable)
 
     def press(number: int, frame: Any) -> None:
         pressed.append(number)
         raise KeyboardInterrupt
 
     signal.signal(signal.SIGINT, press)
+    sys.unraisablehook = report_others
     try:
         yield
     finally:
+        sys.unraisablehook = report
         signal.signal(signal.SIGINT, before)
     if pressed:
         raise KeyboardInterrupt

@@ -96,9 +96,10 @@ def test_the_variables_of_instructions_are_those_that_numba_finds(function: Any)
     assert sum(len(shortcuts._variables(each, vars(each))) for each in instructions) > len(instructions)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_no_ctrl_c_is_lost_while_a_kernel_compiles() -> None:
-    """What Python raises in a function that compiled code calls back ends there, with a message on stderr."""
+def test_no_ctrl_c_is_lost_while_a_kernel_compiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What Python raises in a function that compiled code calls back ends there, and is reported unless it is a Ctrl-C."""
+    reported: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda unraisable: reported.append(unraisable.exc_type))
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     called: list[str] = []
 
@@ -107,9 +108,16 @@ def test_no_ctrl_c_is_lost_while_a_kernel_compiles() -> None:
         called.append(signature)
         return "compiled"
 
+    def compile_with_error(signature: Any) -> str:
+        ctypes.CFUNCTYPE(None)(lambda: 1 // 0)()
+        return "compiled"
+
     try:
         with pytest.raises(KeyboardInterrupt):
             linked_flat(compile_with_callback)("while it compiles")
+        assert reported == []
+        assert linked_flat(compile_with_error)("with an error") == "compiled"
+        assert reported == [ZeroDivisionError]
         assert called and signal.getsignal(signal.SIGINT) is signal.default_int_handler
         assert linked_flat(lambda signature: "compiled")("again") == "compiled"
         # A handler of another kind, as a run has it, stays where it is.

@@ -72,7 +72,7 @@ def simulated(truth_known):
         | ({"covered": 0.99875} if truth_known else {}),
         "limits": {"violations": 7},
         "target_stretch": 1.0,
-        "events": ["cycle 812: IMU 3 is left out: it is frozen"],
+        "events": ["cycle 812 (0.812 s): IMU 3 is left out: it is frozen"],
         "real_time_factor": 12.34,
         "cycle_us": {"p50": 1.0, "p99": 2.0, "p999": 3.0},
     }
@@ -97,7 +97,7 @@ def test_a_simulation_prints_its_errors(tables, capsys, truth_known, rows):
     assert ("the truth is not known" in printed) == (not truth_known)
     assert "protection level p50/p99/max 2.000/2.000/2.000 mm, 0.172/0.172/0.172 deg" in printed
     assert ("; it covers the error in 99.875 % of the cycles" in printed) == truth_known
-    assert "cycle 812: IMU 3 is left out: it is frozen\n" in printed
+    assert "cycle 812 (0.812 s): IMU 3 is left out: it is frozen\n" in printed
     assert "limits violated by the reference: 7; 12.3 times real time; cycle p50/p99/p99.9 1.0/2.0/3.0 us" in printed
 
 
@@ -116,7 +116,7 @@ RUN = {
     "refused": ["locked memory"],
     "late": 8,
     "refused_packets": 9,
-    "events": ["cycle 3: armed"],
+    "events": ["cycle 3 (0.003 s): armed"],
     "recording": {"files": ["a.mcap", "b.mcap"], "lost": 200},
     "round_trip_bars": [[8.0, 9.5, 16.0], [3.0, 1.0, 2.0]],
     "identity": {"name": "rig", "parts": {"drive": "1", "IMU": "2"}},
@@ -136,7 +136,7 @@ def test_a_run_prints_its_figures(tables, capsys, monkeypatch):
     assert [run._timing_cell(us, 5.0).alarm for us in (5.0, 5.1)] == [False, True]
     lines = capsys.readouterr().out.splitlines()
     for line in (
-        "cycle 3: armed",
+        "cycle 3 (0.003 s): armed",
         "over budget, as the table shows: wake p99",
         "greatest protection level 2.500 mm, 0.573 deg",
         "without locked memory",
@@ -248,7 +248,7 @@ def test_a_replay_says_how_it_came_out(monkeypatch, capsys, tmp_path, changes, s
 
 
 def test_the_view_of_a_run_shows_the_latest_cycle():
-    records, link, state = np.zeros(5, RECORD), np.zeros(LINK_SIZE, np.int64), RunState()
+    records, link, state = np.zeros(5, RECORD), np.zeros(LINK_SIZE, np.int64), RunState(1e-3)
     assert "preparing" in _view("title", state, 0.0).rows[0][1].text
     roll, pitch, yaw = np.radians([10.0, -20.0, 30.0])
     turns = [rotation_from_vector(vector) for vector in ([0, 0, yaw], [0, pitch, 0], [roll, 0, 0])]

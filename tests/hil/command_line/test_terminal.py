@@ -70,7 +70,7 @@ def test_without_a_terminal_a_run_that_takes_long_to_begin_says_so(monkeypatch, 
     with terminal.live_view("hexapod", "circle", 1000.0) as show:
         now[0] += waited
         for _ in range(3):
-            show(RunState())
+            show(RunState(1e-3))
     told = capsys.readouterr().err.splitlines()
     assert len(told) == lines
     assert all("preparing" in line and "35 s" in line for line in told)

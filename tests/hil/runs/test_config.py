@@ -108,9 +108,11 @@ def test_a_fault_of_an_encoder_that_an_emulated_rig_lacks_is_refused():
     ("changes", "message"),
     [
         ({"faults": ("encoder-dead:2",)}, "--fault breaks an encoder, and there is none: add --lengths"),
+        ({"faults": ("imu-stuck:2,sensor=gyroscope,axis=x,at=10",)}, "at=10 begins at 10 s, when the motion of 10 s is over"),
+        ({"faults": ("base-tilt,axis=x,size_deg=1,at=3",), "duration": 2.0}, "begins at 3 s, when the motion of 2 s is over"),
         ({"lengths": "incremental", "fusion": "section-5", "magnetometer": True}, "section 5 takes no lengths"),
     ],
 )
-def test_what_would_do_nothing_with_encoders_is_refused(changes, message):
+def test_what_would_do_nothing_is_refused(changes, message):
     with pytest.raises(InputError, match=message):
         SimulationConfig(**changes)

@@ -253,7 +253,7 @@ def test_a_run_on_the_clock_records_its_frames_and_says_how_far_the_tool_is_off(
     true = records["truth"][:, :3] + Rotation.from_quat(np.stack([x, y, z, w], axis=1)).apply(NEEDLE[:3, 3])
     error = records["position"] + records["rotation"] @ NEEDLE[:3, 3] - true
     assert summary["errors_m"]["tool"] == pytest.approx(np.sqrt(np.mean(np.sum(error**2, axis=1))))
-    assert "tool" not in RunState().errors()
+    assert "tool" not in RunState(1e-3).errors()
     status = main(["frames", "zero", cell.frames, "here", "--parent", "base", "--recording", str(path), "--at", "0.4"])
     assert status == 0
     last = records[1e-9 * records["time_ns"] <= 0.4][-1]

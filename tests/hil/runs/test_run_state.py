@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from controller.safety.causes import Cause
 from hil.loop.records import LINK_SIZE, RECORD, Link
 from hil.runs.run_state import RunState
 from plant.pose import quaternion_from_rotation, rotation_from_vector
 
-CYCLES = 60
+CYCLES, PERIOD_S = 60, 2e-3
 DISTANCE_M, TRACKING_M, ANGLE_RAD = 3e-3, 2e-3, 0.02
 
 
@@ -15,7 +16,7 @@ DISTANCE_M, TRACKING_M, ANGLE_RAD = 3e-3, 2e-3, 0.02
 @pytest.mark.parametrize("portion", [1, 7, CYCLES])
 def test_the_figures_are_those_of_the_cycles_and_legs_that_there_are(legs, portion):
     random = np.random.default_rng(legs)
-    buffer, link, state = np.zeros(CYCLES + 1, RECORD), np.zeros(LINK_SIZE, np.int64), RunState()
+    buffer, link, state = np.zeros(CYCLES + 1, RECORD), np.zeros(LINK_SIZE, np.int64), RunState(PERIOD_S)
     records = buffer[:CYCLES]
     records["cycle"] = np.arange(CYCLES)
     records["lengths"][:, :legs] = random.uniform(0.3, 0.5, (CYCLES, legs))
@@ -47,3 +48,13 @@ def test_the_figures_are_those_of_the_cycles_and_legs_that_there_are(legs, porti
     assert (state.missed, state.late, state.refused_packets, state.latest["cycle"]) == (5, 3, 2, CYCLES - 1)
     figures = state.timing.figures()
     assert (figures["wake"]["n"], figures["round trip"]["n"]) == (CYCLES, CYCLES // 2)
+
+
+def test_an_event_has_its_cycle_and_its_time():
+    state, records = RunState(PERIOD_S), np.zeros(3, RECORD)
+    records["cycle"] = 40, 41, 42
+    records["status"], records["event_index"] = 17, -1
+    records["event_value"] = records["event_limit"] = np.nan
+    records["event_count"][1], records["event_cause"][1, 0] = 1, Cause.ARMED
+    state.add(records)
+    assert state.events == ["cycle 41 (0.082 s): armed"]
