@@ -38,6 +38,7 @@ class Page:
         self._form: RunForm | None = None
         self._note = f"**No run** answers at {address}."
         self._wanted: list[str] | None = None
+        self._chosen: list[str] = []
         self._started: StartedRun | None = None
         self._live: LivePanel | None = None
         server.on_client_connect(self._welcome)
@@ -80,7 +81,7 @@ class Page:
         """
         if self._wanted is not None or (self._started is not None and self._started.status is None):
             raise InputError("a run is being started: wait until it is here")
-        self._wanted = options
+        self._wanted = self._chosen = options
 
     def _attached(self) -> LivePanel | None:
         try:
@@ -133,5 +134,5 @@ class Page:
             self._started, self._wanted = StartedRun([*self._wanted, *self._channel]), None
         if self._form is None:
             self._server.gui.reset()
-            self._form = RunForm(self._server, self.start)
+            self._form = RunForm(self._server, self.start, self._chosen)
         self._form.say(note)

@@ -10,15 +10,22 @@ from typing import Any
 
 import viser
 
+from controller.calibration.file import load_calibration
+from controller.frames import load_frames
 from controller.planning import OPERATOR_TARGET
 from controller.planning.motions import load_motion
 from controller.planning.motions.built_in import NAMES
 from controller.planning.target import MOTION_SUFFIX
 from hil.panel.gui import set_text, tell_not_done
-from plant.checks import check_duration, check_rate
+from hil.runs.config import FUSIONS
+from plant.checks import check_duration, check_rate, checked_seed
 from plant.errors import GoughError, InputError
 from plant.imu import PRESETS
 from plant.mechanism import load_in_space, preset_names
+
+_NONE = "none"
+_TOO_SLOW = "filterpy"
+"""A fusion that is too slow for the clock."""
 
 _MOST_FILES = 50
 _WORDS = 12
@@ -73,25 +80,36 @@ class RunForm:
     Args:
         server: of the page.
         start: is called with the options of 'gough run' when a browser wants one.
+        before: the options of the last run that was wanted, which are chosen again.
 
     Attributes:
         choices: by option of 'gough run', the control and what it offers.
     """
 
-    def __init__(self, server: viser.ViserServer, start: Callable[[list[str]], None]) -> None:
+    def __init__(
+        self, server: viser.ViserServer, start: Callable[[list[str]], None], before: Sequence[str] = ()
+    ) -> None:  # fmt: skip
         self._start = start
+        last = dict(zip(before[::2], before[1::2], strict=True))
         gui = server.gui
         self._note = gui.add_markdown("")
-        mechanisms, targets = _files(load_in_space), [*_files(load_motion), *map(str, sorted(Path().glob("*.csv")))]
+        targets = [*_files(load_motion), *map(str, sorted(Path().glob("*.csv")))]
         self.choices: dict[str, tuple[Any, tuple[str, ...]]] = {}
         for flag, label, names in (
-            ("--mechanism", "Mechanism", (*_first("hexapod", preset_names()), *mechanisms)),
+            ("--mechanism", "Mechanism", (*_first("hexapod", preset_names()), *_files(load_in_space))),
             ("--target", "Target", (OPERATOR_TARGET, *NAMES, *targets)),
+            ("--frames", "Frames", (_NONE, *_files(load_frames))),
             ("--imu", "IMUs", _first("mpu9150-calibrated", PRESETS)),
+            ("--calibration", "Calibration", (_NONE, *_files(load_calibration))),
+            ("--fusion", "Fusion", _first("compiled", [each for each in FUSIONS if each != _TOO_SLOW])),
         ):
-            self.choices[flag] = gui.add_dropdown(label, names), names
-        self._duration = gui.add_number("Duration [s]", 60.0, min=0.1, max=36000.0, step=0.1)
-        self._rate = gui.add_number("Rate [Hz]", 500.0, min=50.0, max=4000.0, step=1.0)
+            chosen = last.get(flag, names[0])
+            self.choices[flag] = gui.add_dropdown(label, names, initial_value=chosen if chosen in names else names[0]), names
+        numbers = ("--duration", 60.0), ("--rate", 500.0), ("--seed", 0.0)
+        duration, rate, seed = (float(last.get(flag, default)) for flag, default in numbers)
+        self._duration = gui.add_number("Duration [s]", duration, min=0.1, max=36000.0, step=0.1)
+        self._rate = gui.add_number("Rate [Hz]", rate, min=50.0, max=4000.0, step=1.0)
+        self._seed = gui.add_number("Seed of the IMUs", seed, min=0.0, step=1.0)
         button = gui.add_button("Start the run", color="blue")
         gui.add_markdown(
             "It drives the simulated plant. Runs on a rig begin elsewhere, with `gough run`; this page finds them."
@@ -113,17 +131,20 @@ class RunForm:
         """The options of the run that is asked for.
 
         Raises:
-            InputError: a browser has sent what it was not offered, or a duration or a rate that no run can have.
+            InputError: a browser has sent what it was not offered, or a duration, a rate or a seed that no run can have.
         """
-        options = []
+        options: list[str] = []
         for flag, (choice, names) in self.choices.items():
             if choice.value not in names:
                 raise InputError(f"there is no {flag[2:]} {choice.value!r} to choose: reload the page")
-            options += [flag, choice.value]
+            if choice.value != _NONE:
+                options += [flag, choice.value]
         duration, rate = float(self._duration.value), float(self._rate.value)
         check_duration(duration)
         check_rate(rate)
-        return [*options, "--duration", f"{duration:g}", "--rate", f"{rate:g}", *_PATIENT]
+        seed = self._seed.value
+        checked_seed(seed := int(seed) if float(seed).is_integer() else seed)
+        return [*options, "--duration", f"{duration:g}", "--rate", f"{rate:g}", "--seed", f"{seed}", *_PATIENT]
 
 
 def _first(name: str, names: Any) -> tuple[str, ...]:

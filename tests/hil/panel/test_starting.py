@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from hil.command_line import main
 from hil.panel.access import close_server, open_server
 from hil.panel.page import NotBegunError, Page
 from hil.panel.starting import RunForm, StartedRun
@@ -31,9 +32,15 @@ def test_the_form_offers_presets_and_the_files_of_the_folder_and_takes_nothing_e
     Path("dwell.toml").write_text('[[elements]]\nkind = "dwell"\nduration = 1.0\n')
     Path("points.toml").write_text("[points.park]\nposition = [0.0, 0.0, -0.02]\n")
     Path("path.csv").write_text("time_s,x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n")
+    assert main(["frames", "set", "cell.toml", "table", "--parent", "base", "--position", "0,0,0.1"]) == 0
+    Path("measured.toml").write_text("[imu_0.accelerometer]\nbias = [0.1, 0.0, 0.0]\n")
     form = RunForm(server, lambda options: None)
     options = form.options()
     assert options[:6] == ["--mechanism", "hexapod", "--target", "operator", "--imu", "mpu9150-calibrated"]
+    assert not {"--frames", "--calibration", "none"} & {*options}
+    assert form.choices["--frames"][1] == ("none", "cell.toml")
+    assert form.choices["--calibration"][1] == ("none", "measured.toml")
+    assert "whole" in form.choices["--fusion"][1] and "filterpy" not in form.choices["--fusion"][1]
     mechanism, names = form.choices["--mechanism"]
     assert "planar-3rpr" in names and "mine.toml" in names and "dwell.toml" not in names and "points.toml" not in names
     target, names = form.choices["--target"]
@@ -45,6 +52,11 @@ def test_the_form_offers_presets_and_the_files_of_the_folder_and_takes_nothing_e
         duration=float(chosen["--duration"]), rate=float(chosen["--rate"]),
     )  # fmt: skip
     assert config.mechanism == "mine.toml" and config.rig == "fmu"
+    form.choices["--calibration"][0].value, form._seed.value, form._rate.value = "measured.toml", 7.0, 250.0
+    again = RunForm(server, lambda options: None, form.options())
+    assert again.options() == form.options() and {"measured.toml", "7", "250"} <= {*again.options()}
+    Path("measured.toml").unlink()
+    assert "--calibration" not in RunForm(server, lambda options: None, form.options()).options()
     # As a browser might send it.
     target.value = "operator:0.0.0.0:1"
     with pytest.raises(InputError, match=r"there is no target 'operator:0\.0\.0\.0:1' to choose"):
@@ -58,6 +70,9 @@ def test_the_form_offers_presets_and_the_files_of_the_folder_and_takes_nothing_e
         ("_duration", -1.0, "the duration is -1 s"),
         ("_rate", 1e9, "the rate is 1e\\+09 Hz; it must be 50 to 4000 Hz"),
         ("_rate", float("inf"), "the rate is inf Hz"),
+        ("_seed", -1.0, "the seed is -1; it must be a whole number"),
+        ("_seed", 0.5, "the seed is 0.5; it must be a whole number"),
+        ("_seed", float("nan"), "the seed is nan; it must be a whole number"),
     ],
 )
 def test_numbers_that_no_run_can_have_are_refused_before_one_is_started(server, control, value, said):
