@@ -1,6 +1,7 @@
 """What the records of a run say: how far the pose was off before and after anything was told, and who was left out."""
 
 import json
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,14 @@ from numpy.typing import NDArray
 from controller.safety.causes import Cause, Mode
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
-from plant.pose import Array, pose_errors, rotation_from_vector, rotations_from_quaternions, vector_from_rotation
+from plant.pose import (
+    Array,
+    pose_errors,
+    quaternion_from_rotation,
+    rotation_from_vector,
+    rotations_from_quaternions,
+    vector_from_rotation,
+)
 from plant.truth import TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
 
 FORBIDDEN_POSITION_M, FORBIDDEN_ROTATION_RAD = 5e-3, float(np.radians(1.0))
@@ -21,7 +29,7 @@ _SAY_NOTHING = (
 _MOST_EVENTS = 12
 
 _MOST_LOST = 10
-"""More frames in a row are not lost: with a fifth of them lost, so many are in one of ten million cases."""
+"""A longer gap is no loss of frames: if a fifth is lost, ten in a row are lost once in ten million."""
 
 
 def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate: float) -> dict[str, Any]:
@@ -49,12 +57,13 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
         how many of them it has `covered`, and its 99th percentiles `level_position` and `level_rotation`.
     """
     steering = np.isin(records["mode"], (Mode.RUNNING, Mode.STOPPING))
-    position, rotation = _errors(records)
+    truth = _truth(records)
+    position, rotation = _errors(records, truth)
     cycles = np.arange(len(records))
     events = _events(records, begin)
     first = events[0] if events else None
     told_at = first[0] if first else len(records)
-    encoder_off = _encoder_off(records, begin, told_at)
+    encoder_off = _encoder_off(records, truth, begin, told_at)
     before, after = steering & (cycles >= begin) & (cycles <= told_at), steering & (cycles > told_at)
     used = (records["imus"][:, None] >> np.arange(IMU_COUNT)) & 1 != 0
     lost = ~used & (steering & (cycles >= begin))[:, None]
@@ -82,7 +91,7 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
         ),
         "position_then": position_then,
         "rotation_then": rotation_then,
-        "deviation": _most(np.abs(records["truth"][:, TRUTH_LENGTHS] - references).max(axis=1), steering & (cycles >= begin)),
+        "deviation": _most(np.abs(truth[:, TRUTH_LENGTHS] - references).max(axis=1), steering & (cycles >= begin)),
         "encoder_off": encoder_off,
         "cycles": int(steering.sum()),
         "rms_position": _rms(position[steering]),
@@ -91,56 +100,60 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
     }
 
 
-def _errors(records: Record) -> tuple[Array, Array]:
+def _errors(records: Record, truth: Array) -> tuple[Array, Array]:
     """The distance [m] and the angle [rad] of the estimate from the truth, (N,) each; NaN counts as infinitely far."""
-    errors = pose_errors(records["position"], records["rotation"], *_true_poses(records))
+    errors = pose_errors(records["position"], records["rotation"], truth[:, TRUTH_POSITION].copy(), _rotations(truth))
     position, rotation = np.linalg.norm(errors.reshape(-1, 2, 3), axis=2).T
     return np.nan_to_num(position, nan=np.inf, posinf=np.inf), np.nan_to_num(rotation, nan=np.inf, posinf=np.inf)
 
 
-def _true_poses(records: Record) -> tuple[Array, Array]:
-    """Positions (N, 3) [m] and rotations (N, 3, 3).
+def _rotations(truth: Array) -> Array:
+    return rotations_from_quaternions(np.ascontiguousarray(truth[:, TRUTH_QUATERNION]))
 
-    While the rig does not answer, the truth in the records is that of its last answer. Its drives go on at their last speed,
-    and so does the pose here. On CAN the truth has a frame of its own. Where that was lost, the truth is that of an earlier
-    cycle, and the pose here is between those of the frames before and after.
+
+def _truth(records: Record) -> Array:
+    """Pose and lengths (N, 13) of the platform, also where the records have those of an earlier cycle.
+
+    On CAN the truth has a frame of its own. Where that was lost, the platform was between where the frames before and after
+    say. While the rig does not answer, its drives go on at their last speed, and so does the platform here.
     """
-    positions = records["truth"][:, TRUTH_POSITION].copy()
-    rotations = rotations_from_quaternions(np.ascontiguousarray(records["truth"][:, TRUTH_QUATERNION]))
-    periods = 1 + records["missed"]
-    shift, turn = np.zeros(3), np.zeros(3)
-    for cycle in np.flatnonzero(records["silent"] > 0).tolist():
-        if cycle > 1 and records["silent"][cycle - 1] == 0:
-            shift = (positions[cycle - 1] - positions[cycle - 2]) / periods[cycle - 1]
-            turn = vector_from_rotation(rotations[cycle - 1] @ rotations[cycle - 2].T) / periods[cycle - 1]
-        positions[cycle] = positions[cycle - 1] + periods[cycle] * shift
-        rotations[cycle] = rotation_from_vector(periods[cycle] * turn) @ rotations[cycle - 1]
-    periods_until = np.cumsum(periods)
-    for before, after in _lost_frames(records):
-        whole_turn = vector_from_rotation(rotations[after] @ rotations[before].T)
-        for cycle in range(before + 1, after):
-            share = (periods_until[cycle] - periods_until[before]) / (periods_until[after] - periods_until[before])
-            positions[cycle] = positions[before] + share * (positions[after] - positions[before])
-            rotations[cycle] = rotation_from_vector(share * whole_turn) @ rotations[before]
-    return positions, rotations
+    truth: Array = records["truth"][:, : TRUTH_LENGTHS.stop].copy()
+    times = np.cumsum(1 + records["missed"])
+    fresh = np.flatnonzero(_fresh(records)).tolist()
+    for before, after in pairwise([*fresh, len(records)]):
+        gap = slice(before + 1, after)
+        silent = (records["silent"][gap] > 0).any()
+        first, last = (max(before - 1, 0), before) if silent else (before, after)
+        if gap.start == after or first == last:
+            continue
+        shares = (times[gap] - times[before]) / (times[last] - times[first])
+        ends = _rotations(truth[[first, last, before]])
+        turn = vector_from_rotation(ends[1] @ ends[0].T)
+        truth[gap] = truth[before] + shares[:, None] * (truth[last] - truth[first])
+        truth[gap, TRUTH_QUATERNION] = quaternion_from_rotation(
+            np.array([rotation_from_vector(share * turn) @ ends[2] for share in shares])
+        )
+    return truth
 
 
-def _lost_frames(records: Record) -> list[tuple[int, int]]:
-    """The last cycle before and the first one after each gap in which the rig has answered and the truth did not change.
+def _fresh(records: Record) -> NDArray[np.bool_]:
+    """In which cycles (N,) the truth is their own. Where it does not change for long, or until the end, the platform stands."""
+    answered = records["silent"] == 0
+    # Not all rigs tell the currents.
+    changed = np.r_[True, (np.diff(records["truth"][:, : TRUTH_LENGTHS.stop], axis=0) != 0.0).any(axis=1)]
+    same = answered & ~changed
+    bounds = np.flatnonzero(np.diff(np.r_[False, same, False]))
+    for begin, end in bounds.reshape(-1, 2).tolist():
+        if end - begin > _MOST_LOST or end == len(records):
+            same[begin:end] = False
+    fresh: NDArray[np.bool_] = answered & ~same
+    fresh[0] = True
+    return fresh
 
-    Where it did not change for longer, the platform stands.
-    """
-    changes = np.flatnonzero((np.diff(records["truth"], axis=0) != 0.0).any(axis=1) | (records["silent"][1:] > 0)) + 1
-    return [
-        (before, after)
-        for before, after in zip(changes[:-1].tolist(), changes[1:].tolist(), strict=True)
-        if 1 < after - before <= _MOST_LOST + 1 and records["silent"][before] == records["silent"][after] == 0
-    ]
 
-
-def _encoder_off(records: Record, begin: int, told_at: int) -> float | None:
+def _encoder_off(records: Record, truth: Array, begin: int, told_at: int) -> float | None:
     """How far any encoder's reading changed otherwise than its length, from a cycle before `begin` until one [m]."""
-    off = records["length"] - records["truth"][:, TRUTH_LENGTHS]
+    off = records["length"] - truth[:, TRUTH_LENGTHS]
     answered = records["silent"] == 0
     first = max(begin - 1, 0)
     until = off[first : told_at + 1][answered[first : told_at + 1]]

@@ -147,7 +147,7 @@ class LivePanel:
         while events:
             event = events.popleft()
             told = str(event["event"])
-            self._events.append(event_line(event["cycle"], event["time"], told) if "cycle" in event else told)
+            self._events.append(event_line(event["cycle"], event["time"], told) if "time" in event else told)
 
     def _show(self, state: dict[str, Any], last: bool) -> None:
         with self._server.atomic():

@@ -24,8 +24,8 @@ from plant.imu import PRESETS
 from plant.mechanism import load_in_space, preset_names
 
 _NONE = "none"
-_TOO_SLOW = "filterpy"
-"""A fusion that is too slow for the clock."""
+_OFFERED_FUSIONS = tuple(name for name in FUSIONS if name not in ("filterpy", "section-5"))
+"""The first is too slow for the clock, and the other one needs a magnetometer."""
 
 _MOST_FILES = 50
 _WORDS = 12
@@ -101,13 +101,14 @@ class RunForm:
             ("--frames", "Frames", (_NONE, *_files(load_frames))),
             ("--imu", "IMUs", _first("mpu9150-calibrated", PRESETS)),
             ("--calibration", "Calibration", (_NONE, *_files(load_calibration))),
-            ("--fusion", "Fusion", _first("compiled", [each for each in FUSIONS if each != _TOO_SLOW])),
+            ("--fusion", "Fusion", _first("compiled", _OFFERED_FUSIONS)),
         ):
             chosen = last.get(flag, names[0])
             self.choices[flag] = gui.add_dropdown(label, names, initial_value=chosen if chosen in names else names[0]), names
         numbers = ("--duration", 60.0), ("--rate", 500.0), ("--seed", 0.0)
         duration, rate, seed = (float(last.get(flag, default)) for flag, default in numbers)
-        self._duration = gui.add_number("Duration [s]", duration, min=0.1, max=36000.0, step=0.1)
+        # A browser need not have kept to the control's limits.
+        self._duration = gui.add_number("Duration [s]", min(max(duration, 0.1), 36000.0), min=0.1, max=36000.0, step=0.1)
         self._rate = gui.add_number("Rate [Hz]", rate, min=50.0, max=4000.0, step=1.0)
         self._seed = gui.add_number("Seed of the IMUs", seed, min=0.0, step=1.0)
         button = gui.add_button("Start the run", color="blue")
@@ -142,8 +143,8 @@ class RunForm:
         duration, rate = float(self._duration.value), float(self._rate.value)
         check_duration(duration)
         check_rate(rate)
-        seed = self._seed.value
-        checked_seed(seed := int(seed) if float(seed).is_integer() else seed)
+        seed: Any = self._seed.value
+        seed = checked_seed(int(seed) if float(seed).is_integer() else seed)
         return [*options, "--duration", f"{duration:g}", "--rate", f"{rate:g}", "--seed", f"{seed}", *_PATIENT]
 
 

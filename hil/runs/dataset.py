@@ -13,9 +13,8 @@ import xarray as xr
 
 from controller.safety.causes import Mode
 from hil.loop.records import STAGES
-from hil.recording.mcap import events_of
 from hil.runs.recorded_run import recorded_run
-from hil.runs.run_state import event_line
+from hil.runs.run_state import event_line, told_in
 from hil.runs.simulation import SimulationResult
 from plant.compiled import Record
 from plant.dynamics.variables import IMU_COUNT
@@ -182,16 +181,11 @@ def _of_components(rotations: Array, text: str) -> Any:
 
 
 def _attributes(config: dict[str, Any], mechanism: Mechanism, records: Record) -> dict[str, Any]:
-    eventful = records[records["event_count"] > 0]
     return {
         "mechanism": mechanism.name,
         "config": json.dumps(config),
         "version": config.get("version", version("gough")),
-        "events": [
-            event_line(int(each["cycle"]), int(each["cycle"]) / float(config["rate"]), text)
-            for each in eventful
-            for text in events_of(each)
-        ],
+        "events": [event_line(*event) for event in told_in(records, 1.0 / float(config["rate"]))],
     }
 
 

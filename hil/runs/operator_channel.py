@@ -29,10 +29,11 @@ from controller.planning.points import HOME
 from controller.safety.causes import Cause
 from hil.loop.records import Link, StopRequest
 from hil.realtime.scheduling import come_before_others
-from hil.recording.mcap import events_of, take
+from hil.recording.mcap import take
 from hil.runs.channel_process import MOST_CLIENTS
 from hil.runs.operated_platform import DEADMAN_S, SPEED, TURN_SPEED, OperatedPlatform, RefusedError, Workplace
 from hil.runs.operator_messages import MOST_LINE, RUN_ENDED, VERSION, decode, encode, pose_message
+from hil.runs.run_state import told_in
 from hil.runs.telemetry import (
     estimated_pose,
     frames_message,
@@ -392,10 +393,8 @@ class _Channel:
         self._latest = records[-1].copy()
         if self._platform is not None and self._latest["stop"] != Cause.NONE:
             self._platform.end(Cause(int(self._latest["stop"])).short)
-        for eventful in records[records["event_count"] > 0]:
-            for text in events_of(eventful):
-                cycle = int(eventful["cycle"])
-                self._tell({"event": text, "cycle": cycle, "time": cycle * self._period})
+        for cycle, seconds, text in told_in(records, self._period):
+            self._tell({"event": text, "cycle": cycle, "time": seconds})
 
     def _telemetry(self) -> dict[str, Any]:
         """What the run does now, in SI units."""

@@ -1,5 +1,6 @@
 """What the supervisor sees of a run while it goes on."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import sqrt
 
@@ -22,15 +23,21 @@ def event_line(cycle: int, seconds: float, text: str) -> str:
     return f"cycle {cycle} ({seconds:.3f} s): {text}"
 
 
-def note_events(records: Record, period: float, noted: list[str]) -> None:
-    """Add the events in these records to those that are noted, as lines; the period is in seconds."""
+def told_in(records: Record, period: float) -> Iterator[tuple[int, float, str]]:
+    """The events in these records: cycle, time since the first cycle [s], and words; the period is in seconds."""
     for eventful in records[records["event_count"] > 0]:
         cycle = int(eventful["cycle"])
         for text in events_of(eventful):
-            if len(noted) < _MOST_EVENTS:
-                noted.append(event_line(cycle, cycle * period, text))
-            elif len(noted) == _MOST_EVENTS:
-                noted.append("later events are not listed")
+            yield cycle, cycle * period, text
+
+
+def note_events(records: Record, period: float, noted: list[str]) -> None:
+    """Add the events in these records to those that are noted, as lines; the period is in seconds."""
+    for event in told_in(records, period):
+        if len(noted) < _MOST_EVENTS:
+            noted.append(event_line(*event))
+        elif len(noted) == _MOST_EVENTS:
+            noted.append("later events are not listed")
 
 
 @dataclass(eq=False)

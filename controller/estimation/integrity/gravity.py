@@ -1,20 +1,23 @@
 """How far the estimated pose has drifted from the one that gravity shows.
 
-All accelerometers read gravity, and the pose says along which of their axes. In a window of the fault filter they read
-`z = J m + b` more than pose and planned acceleration say, with the error m of the pose (6) and constant errors b of the
-sensors. Least squares over all accelerometers, faded with `_MEMORY_S`, give
+All accelerometers read gravity, and the pose says along which of their axes. In a window of the fault filter, their readings
+differ by `z = J m + b` from what pose and planned acceleration predict, with the error m of the pose (6) and constant errors b
+of the sensors. Least squares over all accelerometers, faded with `_MEMORY_S`, give
 
     m + c = (sum J^T W J)^-1 sum J^T W z,
 
 where c is what b does to it: some tenths of a millimetre, which hardly change. So the mean of m + c since the motion began,
-faded with `_REFERENCE_S`, tells c, and what is left is how far the pose has drifted since. The gyroscopes have no part in it:
-errors that they share show themselves here when the filters still take them for motion.
+faded with `_REFERENCE_S`, tells c, and what is left is how far the pose has drifted since. Of a drift that goes on, the mean
+takes a part: half of it at first, and all that is older than `_REFERENCE_S`. The gyroscopes have no part in it: errors that
+they share show themselves here when the filters still take them for motion.
+
+With another set of IMUs, c is another one, and the drift is too large until the mean has followed.
 """
 
 import numpy as np
 
 from controller.estimation.whole_mechanism.readings import READINGS
-from controller.least_squares import RANK_TOLERANCE, solve_square
+from controller.least_squares import solve_square
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
@@ -28,11 +31,17 @@ _MEMORY_S, _REFERENCE_S = 1.0, 30.0
 _FIRST_S = 0.5
 """The least time constant of the reference [s]."""
 
+_LEAST_PIVOT = 1e-3
+"""Gravity shows the pose if the least pivot of the sum is at least so large, as a share of the greatest. With all IMUs it is
+0.01 and more on all presets.
+"""
+
 STATE = record_dtype(
-    information=(np.float64, (POSE, POSE)),  # sum of J^T W J
-    vector=(np.float64, POSE),  # sum of J^T W z
+    information=(np.float64, (IMU_COUNT, POSE, POSE)),  # J^T W J of each IMU, sum
+    vector=(np.float64, (IMU_COUNT, POSE)),  # J^T W z of each IMU, sum
+    follows=np.int64,  # whether the reference is of this motion
+    age=np.float64,  # of the reference [s]
     reference=(np.float64, POSE),  # c [m, rad]
-    age=np.float64,  # of the motion [s]
     system=(np.float64, (POSE, POSE)),  # scratch
     pose=(np.float64, POSE),  # scratch
     drifted=(np.float64, 2),  # by how much position [m] and rotation [rad] have drifted; 0 where gravity does not show the pose
@@ -41,22 +50,30 @@ STATE = record_dtype(
 
 
 @kernel
-def compare_with_gravity(s: Record, filtered: Record, excluded: Array, moves: bool) -> None:
+def compare_with_gravity(s: Record, filtered: Record, imus: Record, moves: bool) -> None:
     """After the jobs of a window: compare the loop's pose with the one that the accelerometers show.
 
     Args:
         s: dtype `STATE`.
         filtered: state of the fault filter.
-        excluded: (7,), which IMUs have been left out.
+        imus: dtype `imu_health.STATE`: which IMUs are used, and which have been left out.
         moves: whether the drives follow the commands.
     """
-    _add_window(s, filtered, excluded)
-    s.system[:] = s.information
-    s.pose[:] = s.vector
-    if not solve_square(s.system, s.pose) > RANK_TOLERANCE:
-        s.drifted[:] = 0.0
-        return
+    _add_window(s, filtered, imus.excluded)
+    s.drifted[:] = 0.0
     if not moves:
+        s.follows = 0
+        return
+    s.system[:] = 0.0
+    s.pose[:] = 0.0
+    for k in range(IMU_COUNT):
+        if imus.used[k] != 0:
+            s.system += s.information[k]
+            s.pose += s.vector[k]
+    if not solve_square(s.system, s.pose) > _LEAST_PIVOT:
+        return
+    if s.follows == 0:
+        s.follows = 1
         s.age = 0.0
         s.reference[:] = s.pose
     s.age += filtered.between
@@ -76,13 +93,20 @@ def _add_window(s: Record, filtered: Record, excluded: Array) -> None:
     s.information *= keep
     s.vector *= keep
     for k in range(IMU_COUNT):
-        if filtered.counted[k] == 0 or excluded[k] != 0:
-            continue
-        weight = filtered.weight[k, 1]
-        for axis in range(3, READINGS):
-            row = filtered.jacobian[k, axis]
-            off = weight * (filtered.mean[k, axis] - filtered.predicted[k, axis])
-            for i in range(POSE):
-                s.vector[i] += off * row[i]
-                for j in range(POSE):
-                    s.information[i, j] += weight * row[i] * row[j]
+        if excluded[k] != 0:
+            s.information[k] = 0.0
+            s.vector[k] = 0.0
+        elif filtered.counted[k] != 0:
+            _add_imu(s.information[k], s.vector[k], filtered, k)
+
+
+@kernel
+def _add_imu(information: Array, total: Array, filtered: Record, k: int) -> None:
+    weight = filtered.weight[k, 1]
+    for axis in range(3, READINGS):
+        row = filtered.jacobian[k, axis]
+        off = weight * (filtered.mean[k, axis] - filtered.predicted[k, axis])
+        for i in range(POSE):
+            total[i] += off * row[i]
+            for j in range(POSE):
+                information[i, j] += weight * row[i] * row[j]

@@ -203,7 +203,7 @@ def publish_level(
         bent: (2,), by how much an encoder could move position [m] and rotation [rad] unseen.
         moved: (2,), by how much they have moved otherwise than commanded, `commanded.STATE`.
         apart: (2,), how far the closed form and the filter that is trusted are from each other.
-        drifted: (2,), how far they have drifted from what gravity shows, `gravity.STATE`.
+        drifted: (2,), how far position and rotation have drifted from what gravity shows, `gravity.STATE`.
     """
     s.misfit += min(1.0, duration / _MISFIT_S) * (misfit - s.misfit)
     beyond = _OF_MISFIT**2 * max(s.misfit - _USUAL_MISFIT, 0.0)

@@ -132,8 +132,8 @@ def step_integrity(
     if time.missed > 0 and not fault_filter.bridge_gap(p.filter, s.filter, time.missed):
         restart_integrity(p, s)
     took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, pose, legs, commands)
-    if took:
-        gravity.compare_with_gravity(s.gravity, s.filter, imus.excluded, s.commanded.following != 0)
+    if took and s.waits == 0:
+        gravity.compare_with_gravity(s.gravity, s.filter, imus, s.commanded.following != 0)
     if s.filter.job > 0 and s.compared != s.filter.windows:
         s.compared = s.filter.windows
         s.contradicts = s.filter.windows > 0 and (

@@ -67,6 +67,8 @@ def moving_exactly():
     made["truth"][:, 3], made["truth"][:, 6] = np.cos(half), np.sin(half)
     made["rotation"] = rotations_from_quaternions(np.ascontiguousarray(made["truth"][:, 3:7]))
     made["position"][:, 2] = 0.0
+    # On CAN nobody tells the currents.
+    made["truth"][:, 13:] = np.nan
     return made
 
 
@@ -79,6 +81,16 @@ def test_while_the_rig_is_silent_the_platform_goes_on_at_its_last_speed():
     assert found["position_before"] < 1e-12 and found["rotation_before"] < 1e-6
     made["position"][215, 0] += 1e-3
     assert judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)["position_before"] == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("lost", [198, 199, 230, 231])
+def test_frames_that_are_lost_just_before_or_after_the_silence_change_nothing(lost):
+    made = moving_exactly()
+    made["truth"][200:230] = made["truth"][199]
+    made["silent"][200:230] = np.arange(1, 31)
+    made["truth"][lost] = made["truth"][lost - 1]
+    found = judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)
+    assert found["position_before"] < 1e-12 and found["rotation_before"] < 1e-6
 
 
 @pytest.mark.parametrize("lost", [1, 2, 10])

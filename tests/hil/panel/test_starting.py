@@ -40,7 +40,7 @@ def test_the_form_offers_presets_and_the_files_of_the_folder_and_takes_nothing_e
     assert not {"--frames", "--calibration", "none"} & {*options}
     assert form.choices["--frames"][1] == ("none", "cell.toml")
     assert form.choices["--calibration"][1] == ("none", "measured.toml")
-    assert "whole" in form.choices["--fusion"][1] and "filterpy" not in form.choices["--fusion"][1]
+    assert "whole" in form.choices["--fusion"][1] and not {"filterpy", "section-5"} & {*form.choices["--fusion"][1]}
     mechanism, names = form.choices["--mechanism"]
     assert "planar-3rpr" in names and "mine.toml" in names and "dwell.toml" not in names and "points.toml" not in names
     target, names = form.choices["--target"]
@@ -55,6 +55,8 @@ def test_the_form_offers_presets_and_the_files_of_the_folder_and_takes_nothing_e
     form.choices["--calibration"][0].value, form._seed.value, form._rate.value = "measured.toml", 7.0, 250.0
     again = RunForm(server, lambda options: None, form.options())
     assert again.options() == form.options() and {"measured.toml", "7", "250"} <= {*again.options()}
+    form._duration.value = 50_000.0
+    assert RunForm(server, lambda options: None, form.options())._duration.value == 36_000.0
     Path("measured.toml").unlink()
     assert "--calibration" not in RunForm(server, lambda options: None, form.options()).options()
     # As a browser might send it.

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from controller.estimation.imu_health import STATE as IMUS
 from controller.estimation.integrity.fault_filter import STATE as FILTER_STATE
 from controller.estimation.integrity.gravity import STATE, compare_with_gravity
 from hil.faults.rows import all_rows
@@ -10,7 +11,14 @@ from hil.faults.trials import Trial, figures_of
 from tests.controller.estimation.integrity.made_up import RATE_HZ, constants, filtered, readings
 
 WINDOW_S = 0.01
-NONE_LEFT_OUT = np.zeros(7, np.int64)
+
+
+def imus(left_out=(), lost=()):
+    made = np.zeros((), IMUS)
+    made["used"] = 1
+    made["used"][[*left_out, *lost]] = 0
+    made["excluded"][[*left_out]] = 1
+    return made[()]
 
 
 def windows(jacobian, off):
@@ -23,10 +31,10 @@ def windows(jacobian, off):
         yield f[()]
 
 
-def drifts(found, excluded=NONE_LEFT_OUT, moves=True):
+def drifts(found, seen=None, moves=True):
     s = np.zeros((), STATE)
     for f in found:
-        compare_with_gravity(s[()], f, excluded, moves)
+        compare_with_gravity(s[()], f, imus() if seen is None else seen, moves)
         yield s["drifted"].copy()
 
 
@@ -48,8 +56,7 @@ def test_a_pose_that_steps_off_is_followed_and_forgotten_as_the_two_time_constan
 def test_the_pose_is_that_of_batch_least_squares_over_all_windows():
     """With windows of different weights and geometry, and an IMU that has been left out."""
     random = np.random.default_rng(2)
-    n, excluded = 40, NONE_LEFT_OUT.copy()
-    excluded[2] = 1
+    n, seen = 40, imus(left_out=[2], lost=[5])
     s, f = np.zeros((), STATE), np.zeros((), FILTER_STATE)
     f["counted"], f["between"] = 1, WINDOW_S
     rows, rights, weights = [], [], []
@@ -57,8 +64,8 @@ def test_the_pose_is_that_of_batch_least_squares_over_all_windows():
         for name in ("jacobian", "mean", "predicted"):
             f[name] = random.normal(size=f[name].shape)
         f["weight"] = random.uniform(0.5, 2.0, f["weight"].shape)
-        compare_with_gravity(s[()], f[()], excluded, False)
-        used = np.flatnonzero(excluded == 0)
+        compare_with_gravity(s[()], f[()], seen, i == n - 1)
+        used = np.flatnonzero(seen["used"])
         rows.append(f["jacobian"][used, 3:, :6].reshape(-1, 6))
         rights.append((f["mean"] - f["predicted"])[used, 3:].ravel())
         weights.append(np.repeat(f["weight"][used, 1], 3) * np.exp(-WINDOW_S * (n - 1 - i)))
@@ -75,36 +82,62 @@ def test_before_the_motion_and_where_gravity_does_not_show_the_pose_nothing_has_
     assert max(each.max() for each in drifts(windows(jacobian, off))) > 0.1
     jacobian[..., 5] = 0.0
     assert max(each.max() for each in drifts(windows(jacobian, off))) == 0.0
-    one_left = np.ones(7, np.int64)
-    one_left[0] = 0
+    one_left = imus(left_out=range(1, 7))
     assert max(each.max() for each in drifts(windows(random.normal(size=(7, 3, 6)), off), one_left)) == 0.0
+
+
+def test_an_imu_that_is_left_out_takes_what_it_has_read_with_it():
+    """Its readings are 1 m/s^2 off; without it nothing has drifted."""
+    random = np.random.default_rng(4)
+    s, off = np.zeros((), STATE), np.zeros((100, 7, 3))
+    off[50:, 3] = 1.0
+    jacobian = random.normal(size=(7, 3, 6))
+    for i, f in enumerate(windows(jacobian, off)):
+        compare_with_gravity(s[()], f, imus(left_out=[3] if i >= 80 else []), True)
+        if i == 79:
+            assert (s["drifted"] > 0.03).all()
+    # The mean of before holds some of it.
+    assert (s["drifted"] < 0.03).all()
+
+
+def test_each_motion_has_its_own_reference():
+    random = np.random.default_rng(5)
+    jacobian = random.normal(size=(7, 3, 6))
+    s, off = np.zeros((), STATE), np.zeros((300, 7, 3))
+    off[100:] = jacobian @ [1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]
+    for i, f in enumerate(windows(jacobian, off)):
+        compare_with_gravity(s[()], f, imus(), not 150 <= i < 250)
+        assert s["drifted"][0] == 0.0 or i < 150 or i > 250
+    assert s["drifted"][0] < 1e-4
 
 
 @pytest.mark.parametrize("biased", [0.0, 0.015])
 def test_an_estimate_that_creeps_away_is_seen_and_constant_errors_are_not(biased):
-    """A hexapod in motion; the estimate creeps by 1 mm and 1 mrad from the third second on, or stays."""
-    for creeps in (0.0, 1e-3):
+    """A hexapod in motion; the estimate creeps by 3 mm and 6 mrad from the third second on, or stays."""
+    for creeps in (0.0, 1.0):
         mechanism, r = readings("mixed", 8.0, 3)
         r.samples[:, 1] += biased * np.random.default_rng(1).normal(size=(7, 3))
         parameters, state = constants(mechanism)
         state = state[()]
         times = np.arange(len(r.samples)) / RATE_HZ
         away = creeps * np.clip((times - 3.0) / 2.0, 0.0, 1.0)
-        off = away[:, None] * np.array([0.0, 0.0, 1.0, 0.0, 1.0, 0.0])
+        off = away[:, None] * np.array([0.0, 0.0, 3e-3, 0.0, 6e-3, 0.0])
         g, found = state["integrity"]["gravity"], []
 
         def compare(state=state, g=g, found=found):
-            compare_with_gravity(g, state["integrity"]["filter"], NONE_LEFT_OUT, True)
+            compare_with_gravity(g, state["integrity"]["filter"], imus(), True)
             found.append(g["drifted"].copy())
 
         filtered(mechanism, r, parameters, state, off, then=compare)
-        usual, late = np.array(found)[100:300].max(axis=0), np.array(found)[-100:]
-        assert usual[0] < 2e-4 and usual[1] < 1.2e-3
+        before, late = np.array(found)[100:300], np.array(found)[-100:]
+        usual = np.array([3e-4, 2e-3])
+        assert (before < usual).all()
         if creeps:
-            # The mean of what has passed holds some of it.
-            np.testing.assert_allclose(late.mean(axis=0), 0.6 * creeps, rtol=0.5)
+            # The readings are a second late, and the mean of 7.5 s holds some of it.
+            expected = 1.0 - np.exp(-2.5) - (7.5 - 4.0 - 1.0) / 7.5
+            np.testing.assert_allclose(late.mean(axis=0), expected * np.array([3e-3, 6e-3]), rtol=0.15)
         else:
-            assert late[:, 0].max() < 2e-4 and late[:, 1].max() < 1.2e-3
+            assert (late < usual).all()
 
 
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
