@@ -203,7 +203,9 @@ def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray
             return
     recorder = Recorder(path, header, time.time_ns() - time.monotonic_ns() + int(link[Link.START]))
     begin, kept_before, flushed = int(link[Link.TAIL]), int(link[Link.KEPT]), time.monotonic()
-    tail, kept = begin, kept_before
+    tail, kept, unsaved = begin, kept_before, 0
+    # The writer must not complete a chunk by itself: the next recorder would not know of it, and write it again.
+    most = _MOST_BYTES // (3 * records.dtype.itemsize)
     ended = False
     while not ended:
         time.sleep(_POLL_S)
@@ -217,13 +219,15 @@ def record(path: Path, header: Mapping[str, Any], records: Record, link: NDArray
             raise
         if lost:
             recorder.write_event(tail, f"{lost} cycles lost: the recorder came too late")
-        recorder.write(taken)
-        kept += len(taken)
-        ended = done and tail == link[Link.HEAD]
-        if ended or time.monotonic() - flushed > _CHUNK_S:
-            recorder.flush()
-            link[Link.KEPT], link[Link.TAIL] = kept, tail
-            flushed = time.monotonic()
+        left = len(taken)
+        for part in np.split(taken, range(most, len(taken), most)):
+            recorder.write(part)
+            kept, unsaved, left = kept + len(part), unsaved + len(part), left - len(part)
+            ended = done and left == 0 and tail == link[Link.HEAD]
+            if ended or unsaved >= most or time.monotonic() - flushed > _CHUNK_S:
+                recorder.flush()
+                link[Link.KEPT], link[Link.TAIL] = kept, tail - left
+                flushed, unsaved = time.monotonic(), 0
     recorder.close()
 
 

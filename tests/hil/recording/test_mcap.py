@@ -244,6 +244,24 @@ def test_a_successor_goes_on_where_the_last_whole_chunk_ended_and_counts_what_wa
     assert abs(found.epoch_ns - (time.time_ns() - HOUR_NS)) < 60 * 10**9
 
 
+def test_what_is_in_the_file_is_known_to_a_successor_however_much_is_taken_at_once(tmp_path, monkeypatch):
+    """A recorder that was held up takes seconds at once, and may be killed at any time."""
+    path = tmp_path / "run.mcap"
+    ring, link = ring_of(2000, capacity=3000)
+    link[Link.DONE] = 1
+    flush, checked = Recorder.flush, []
+
+    def flush_after_a_look(recorder):
+        recorder._file.flush()
+        checked.append(len(read(path).records) if checked else 0)
+        assert checked[-1] == link[Link.TAIL]
+        flush(recorder)
+
+    monkeypatch.setattr(Recorder, "flush", flush_after_a_look)
+    record(path, HEADER, ring, link)
+    assert len(checked) > 5 and read(path).records["cycle"].tolist() == list(range(2000))
+
+
 def test_without_a_supervisor_a_recorder_waits_for_no_run_but_completes_the_one_there_is(tmp_path, monkeypatch):
     path = tmp_path / "run.mcap"
     monkeypatch.setattr(mcap.time, "sleep", lambda seconds: None)

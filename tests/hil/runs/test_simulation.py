@@ -210,7 +210,7 @@ def test_what_was_left_out_is_in_the_summary():
     result = simulate(SimulationConfig(target="sines", duration=1.2, faults=("imu-noise:3,axis=all,size_deg_per_s=20,at=0.8",)))
     events = result.summary()["events"]
     assert events[0].endswith(": armed")
-    assert any(re.fullmatch(r"cycle \d+: IMU 3 is left out: it is noisy \(.*\)", event) for event in events)
+    assert any(re.fullmatch(r"cycle \d+ \(\d\.\d{3} s\): IMU 3 is left out: it is noisy \(.*\)", event) for event in events)
 
 
 @pytest.mark.parametrize("imu", [3, 6])
