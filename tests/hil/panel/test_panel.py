@@ -226,6 +226,9 @@ def test_a_page_without_a_run_starts_one_after_the_other(chromium, tmp_path):
         page.get_by_role("cell", name="conditioning of the Jacobian").wait_for()
         press(page, "Controlled stop")
         page.get_by_text("The run has ended").wait_for()
+        # What was chosen before is still there.
+        assert page.get_by_label("Target", exact=True).input_value() == "circle"
+        choose(page, "Target", "operator")
         choose(page, "Mechanism", "planar-3rpr")
         choose(page, "IMUs", "ideal")
         press(page, "Start the run")

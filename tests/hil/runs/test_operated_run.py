@@ -76,7 +76,8 @@ def test_commands_move_the_plant_and_the_recording_replays(tmp_path):
     points = tmp_path / "points.toml"
     points.write_text("[points.park]\nposition = [0.0, 0.0, -0.02]\n")
     with operated(tmp_path, "--points", points) as (run, address):
-        assert told("move", "park", "--at", address)[1].startswith("the platform is commanded to (0.00, 0.00, -20.00) mm")
+        moved = told("move", "park", "--at", address)
+        assert moved[1].startswith("the platform is commanded to (0.00, 0.00, -20.00) mm"), moved
         figures = tmp_path / "jog.json"
         assert told("jog", "+x", "5mm", "-rz", "2deg", "--at", address, "--json", figures)[0] == 0
         commanded = json.loads(figures.read_text())["commanded"]
