@@ -263,7 +263,10 @@ class SimulationConfig:
         for text in self.faults:
             begin, _ = times_in(words_of_text(text)[2], f"the fault {text!r}")
             if begin >= self.duration:
-                raise InputError(f"--fault {text} begins at {begin:g} s, when the motion of {self.duration:g} s is over")
+                raise InputError(
+                    f"--fault {text} begins at {begin:g} s, when the motion of {self.duration:g} s is over: let it begin "
+                    "earlier, or make --duration longer"
+                )
         if self.base_imu and self.fusion not in FUSIONS_ON_A_MOVING_BASE:
             raise InputError(
                 f"with --base-imu the fusion is one of {', '.join(FUSIONS_ON_A_MOVING_BASE)}, not {self.fusion}: choose one of "

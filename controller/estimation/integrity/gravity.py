@@ -8,22 +8,21 @@ of the sensors. Least squares over all accelerometers, faded with `_MEMORY_S`, g
 
 where c is what b does to it: some tenths of a millimetre, which hardly change. So the mean of m + c since the motion began,
 faded with `_REFERENCE_S`, tells c, and what is left is how far the pose has drifted since. Of a drift that goes on, the mean
-takes a part: half of it at first, and all that is older than `_REFERENCE_S`. The gyroscopes have no part in it: errors that
-they share show themselves here when the filters still take them for motion.
+takes half at first. What is older than `_REFERENCE_S` is all in the mean. The gyroscopes have no part in it: errors that they
+share show themselves here when the filters still take them for motion.
 
 With another set of IMUs, c is another one, and the drift is too large until the mean has followed.
 """
 
 import numpy as np
 
+from controller.estimation.integrity.evidence import POSE
 from controller.estimation.whole_mechanism.readings import READINGS
 from controller.least_squares import solve_square
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 from plant.vectors import dot, vector
-
-POSE = 6
 
 _MEMORY_S, _REFERENCE_S = 1.0, 30.0
 """Time constants with which readings and reference fade [s]."""
@@ -46,7 +45,7 @@ STATE = record_dtype(
     pose=(np.float64, POSE),  # scratch
     drifted=(np.float64, 2),  # by how much position [m] and rotation [rad] have drifted; 0 where gravity does not show the pose
 )
-"""The sums, the reference and what is left; zeros before the motion."""
+"""The sums, the reference, and what is left, which is 0 before the motion."""
 
 
 @kernel
