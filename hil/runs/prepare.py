@@ -1,9 +1,11 @@
 """Preparation of a run: check everything, load the plant or make the rig, plan the motion, load the machine code."""
 
+import pickle
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +25,7 @@ from controller.safety.arming import longest_delay
 from controller.safety.causes import Cause
 from controller.safety.stop import describe_end
 from controller.settings import control_settings, drive_settings, safety_settings, sensor_settings, tables_with
-from controller.workspace import Demands, check_against_limits
+from controller.workspace import Demands, TargetCheck, check_against_limits
 from hil.loop.driver import Loop
 from hil.loop.records import RECORD
 from hil.recording.replay_rig import ReplayRig
@@ -166,7 +168,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
             lengths = leg_lengths(mechanism, target.start.position, target.start.rotation)
             reference = Reference(rest(lengths), 0)
         else:
-            checked = check_against_limits(mechanism, target, config.duration, demands_of(config, mechanism))
+            checked = _checked(pickle.dumps((mechanism, target, config.duration, demands_of(config, mechanism))))
             reference = checked.require_reachable(frames)
             remarks.append(checked.remark)
         planning_time = time.perf_counter() - began
@@ -192,6 +194,12 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
         close_loops(loop.loops, position)
         loop.load(in_python)
         yield loop
+
+
+@lru_cache(maxsize=2)
+def _checked(question: bytes) -> TargetCheck:
+    """The check of a pickled mechanism, target, duration and demands: runs of a study share it, and it takes long."""
+    return check_against_limits(*pickle.loads(question))
 
 
 def demands_of(config: SimulationConfig, mechanism: Mechanism) -> Demands:

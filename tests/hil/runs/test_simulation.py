@@ -232,6 +232,18 @@ def test_a_run_taken_up_from_its_arrays_goes_on_bit_for_bit():
         assert whole.imu.tobytes() == parts.imu.tobytes()
 
 
+def test_runs_of_the_same_motion_share_its_plan_and_leave_it_as_it_is():
+    config = SimulationConfig(duration=0.5)
+    with prepared_loop(config) as first:
+        planned = first.segments.copy()
+        first.follow(first.end)
+        np.testing.assert_array_equal(first.segments, planned)
+    for other, same in ((replace(config, seed=3, fusion="whole"), True), (replace(config, imus=(0, 1, 2, 3, 6)), False)):
+        with prepared_loop(other) as second:
+            assert (second.reference is first.reference) == same
+            np.testing.assert_array_equal(second.segments, planned)
+
+
 @pytest.mark.slow
 def test_filterpy_closes_the_same_loop(monkeypatch):
     taken = Counter()
