@@ -394,7 +394,8 @@ def gough_detectability(options: Namespace) -> int:
     The table has: when the test tells the fault with a probability of 99.9 % [s], and how much of the fault is there then; the
     error of the pose until then [mm / deg], of which 99.9 % of all errors are below, and the part that the fault alone
     contributes; 1.5 times this error; the limit, which is that or, if greater, 3 mm and 0.7 deg for faults of few IMUs and
-    5 mm and 1 deg for shared ones; the least share of the fault that would be told in the run, and the error by it.
+    5 mm and 1 deg for shared ones; the least share of the fault that would be told in the run, and the error by it; the least
+    protection level that covers the error in 99.9 % of the cycles, and how many times the RMS error of a sound estimate it is.
 
     With --measured, the exit status is 1 if an error until something was told is beyond the limit. Nothing is simulated.
     """

@@ -58,7 +58,7 @@ class RowBounds:
         return max(float(getattr(bound, figure)) for bound in self.bounds)
 
     def errors(self, prefix: str = "") -> Errors:
-        """The greatest errors over the seeds; `prefix` names those of a `Bound`: none, fault_ or least_."""
+        """The greatest errors over the seeds; `prefix` names those of a `Bound`: none, fault_, least_, level_ or sound_."""
         return Errors(self.greatest(f"{prefix}position"), self.greatest(f"{prefix}rotation"))
 
     @property
@@ -164,7 +164,7 @@ def table(found: Sequence[RowBounds], measured: Mapping[str, Any] | None = None)
     With the figures of `gough faults`, the measured errors stand beside them, and the verdict for each fusion.
     """
     headings = ("disturbance", "told [s]", "at", "error", "by fault", f"{FACTOR:g} x", "limit")
-    least = ("least", "its error")
+    least = ("least", "its error", "level", "/ RMS")
     result = Table(*headings, *least, *(["measured", "within"] if measured else []))
     for each in found:
         if not each.bounds:
@@ -174,6 +174,8 @@ def table(found: Sequence[RowBounds], measured: Mapping[str, Any] | None = None)
         errors = map(str, (each.errors(), each.errors("fault_"), each.strict, each.limit))
         cells: list[str | Cell] = [each.row.name, when, f"{100.0 * each.greatest('share'):.0f} %", *errors]
         cells += [f"{100.0 * each.greatest('least'):.3g} %", str(each.errors("least_"))]
+        level, sound = each.errors("level_"), each.errors("sound_")
+        cells += [str(level), f"{level.position / sound.position:.1f}/{level.rotation / sound.rotation:.1f}"]
         if measured:
             before = errors_before(each.row, measured).values()
             verdicts = [each.verdict(errors) for errors in before]

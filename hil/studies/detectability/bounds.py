@@ -12,12 +12,13 @@ from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.stats import chi2
 
 from controller.planning.target import load_target
 from hil.runs.config import SimulationConfig
 from hil.studies.detectability.kinematics import Motion, motion_along
-from hil.studies.detectability.likelihood_ratio import POWER, needed_noncentrality
+from hil.studies.detectability.likelihood_ratio import POWER, needed_noncentrality, probability_of_silence
 from hil.studies.detectability.model import LinearModel, Whitened, linear_model, whitened
 from hil.studies.detectability.signatures import Stage, directions_of, signature
 from hil.studies.detectability.uncertainty import Uncertainty
@@ -52,6 +53,8 @@ class Bound:
         fault_position, fault_rotation: what the fault itself does to this estimate.
         least: factor on the fault with which it would be told just at the end of the run.
         least_position, least_rotation: what the fault with this factor does to the estimate until then.
+        level_position, level_rotation: what a protection level must be at least, as `least_level` has it [m], [rad].
+        sound_position, sound_rotation: RMS error of the estimate in motion without a fault [m], [rad].
     """
 
     told_after: float | None
@@ -63,6 +66,10 @@ class Bound:
     least: float
     least_position: float
     least_rotation: float
+    level_position: float
+    level_rotation: float
+    sound_position: float
+    sound_rotation: float
 
 
 def find_bounds(runs: Sequence[Disturbed], uncertainty: Uncertainty) -> list[Bound]:
@@ -126,12 +133,17 @@ def _bound(found: Whitened, data: Array, column: int, run: Disturbed) -> Bound:
     sizes = np.linalg.norm(data[: len(ended), :, column], axis=1)
     least = sqrt(needed / max(noncentrality[-1], 1e-300))
     estimates, covariances = found.estimates[:, :, column], found.covariances
+    moving = ended > 0.0
+    silence = probability_of_silence(noncentrality[moving])
     figures: dict[str, float] = {}
     for name, part in (("position", slice(0, 3)), ("rotation", slice(3, 6))):
         errors = np.linalg.norm(estimates[:, part], axis=1)
         figures[name] = float(quantile_of_size(estimates[during, part], covariances[during, part, part]).max())
         figures[f"fault_{name}"] = float(errors[during].max())
         figures[f"least_{name}"] = least * float(errors.max())
+        means, spreads = estimates[moving, part], covariances[moving, part, part]
+        figures[f"level_{name}"] = least_level(means, spreads, silence)
+        figures[f"sound_{name}"] = float(np.sqrt(np.trace(spreads, axis1=1, axis2=2).mean()))
     return Bound(
         told_after=float(ended[last] - begin) if reached else None,
         share=float(sizes[: last + 1].max() / sizes.max()),
@@ -140,13 +152,41 @@ def _bound(found: Whitened, data: Array, column: int, run: Disturbed) -> Bound:
     )
 
 
-def quantile_of_size(mean: Array, covariance: Array, level: float = POWER) -> Array:
-    """The size (N,) below which normal vectors of mean (N, m) and covariance (N, m, m) are with the probability `level`.
+def least_level(means: Array, covariances: Array, silence: Array) -> float:
+    """The size that a protection level must have at least to be above the error in a share `POWER` of the steps.
 
-    The square of the size is taken for a multiple of a chi-squared variable with the same mean and variance (Satterthwaite).
+    Whatever a level is computed from, it is beyond this size in a share `RAISED` of the time without a fault, so that "it is
+    beyond" is a test, which is silent with the probability `silence` (N,) at each step at least. The error, of mean (N, 3) and
+    covariance (N, 3, 3), does not depend on the data, as the estimate is the best one. 0 if the test hardly ever is silent.
+    """
+
+    def uncovered(size: float) -> float:
+        return float(np.mean(silence * beyond(means, covariances, size))) - (1.0 - POWER)
+
+    # What is told at once needs no level.
+    if uncovered(0.0) <= 0.0:
+        return 0.0
+    return float(brentq(uncovered, 0.0, quantile_of_size(means, covariances, 1.0 - 1e-6).max(), rtol=1e-4))
+
+
+def beyond(mean: Array, covariance: Array, size: float) -> Array:
+    """With what probability (N,) normal vectors of mean (N, m) and covariance (N, m, m) are longer than `size`."""
+    factor, freedom = _like_chi_squared(mean, covariance)
+    probability: Array = chi2.sf(size**2 / factor, freedom)
+    return probability
+
+
+def quantile_of_size(mean: Array, covariance: Array, level: float = POWER) -> Array:
+    """The length (N,) below which normal vectors of mean (N, m) and covariance (N, m, m) are with the probability `level`."""
+    factor, freedom = _like_chi_squared(mean, covariance)
+    quantile: Array = np.sqrt(factor * chi2.ppf(level, freedom))
+    return quantile
+
+
+def _like_chi_squared(mean: Array, covariance: Array) -> tuple[Array, Array]:
+    """The factor and the degrees of freedom of a multiple of a chi-squared variable with the mean and the variance of the
+    square of the length of such vectors (Satterthwaite).
     """
     middle = np.trace(covariance, axis1=1, axis2=2) + np.sum(mean**2, axis=1)
     spread = 2.0 * np.sum(covariance**2, axis=(1, 2)) + 4.0 * np.einsum("ni,nij,nj->n", mean, covariance, mean)
-    factor, freedom = spread / (2.0 * middle), 2.0 * middle**2 / spread
-    quantile: Array = np.sqrt(factor * chi2.ppf(level, freedom))
-    return quantile
+    return spread / (2.0 * middle), 2.0 * middle**2 / spread

@@ -1,11 +1,17 @@
 """The test: how often it speaks without a fault, and how large a fault must be for it to speak almost always."""
 
+import numpy as np
 from scipy.optimize import brentq
-from scipy.stats import chi2, ncx2
+from scipy.stats import chi2, ncx2, norm
+
+from plant.pose import Array
 
 FALSE_ALARM_HOURS = 100.0
 EVALUATIONS_HZ = 10.0
 POWER = 0.999
+
+RAISED = 0.01
+"""Share of the time without a fault in which a protection level may be beyond the size that is stated of it."""
 
 HYPOTHESES = 65
 """Over which the false alarms are shared: of each IMU its gyroscope, its accelerometer, both, and its mounting (28); pairs of
@@ -27,3 +33,14 @@ def needed_noncentrality(dimensions: int, hypotheses: int = HYPOTHESES) -> float
     """The least noncentrality with which the statistic reaches the threshold with the probability `POWER`."""
     least = threshold(dimensions, hypotheses)
     return float(brentq(lambda size: ncx2.sf(least, dimensions, size) - POWER, least, 10.0 * least + 100.0, xtol=1e-9))
+
+
+def probability_of_silence(noncentrality: Array) -> Array:
+    """With what probability a test that speaks in a share `RAISED` of the time without a fault is silent, if it knows what the
+    fault is: by Neyman and Pearson no test is silent less often.
+
+    Args:
+        noncentrality: of the fault, any shape.
+    """
+    silence: Array = norm.cdf(norm.isf(RAISED) - np.sqrt(noncentrality))
+    return silence

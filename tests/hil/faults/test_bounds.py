@@ -22,7 +22,8 @@ def row_of(name):
 
 
 def bound_of(position, rotation, told=0.5):
-    return Bound(told, 0.1, position, rotation, 0.5 * position, 0.5 * rotation, 0.05, position, rotation)
+    own = position, rotation
+    return Bound(told, 0.1, *own, 0.5 * position, 0.5 * rotation, 0.05, *own, 3.0 * position, 3.0 * rotation, *own)
 
 
 def figures(row, *errors):

@@ -4,11 +4,11 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, kstest
+from scipy.stats import chi2, kstest, norm
 
 from hil.runs.config import SimulationConfig
-from hil.studies.detectability.bounds import Disturbed, find_bounds, quantile_of_size
-from hil.studies.detectability.likelihood_ratio import needed_noncentrality, threshold
+from hil.studies.detectability.bounds import Disturbed, find_bounds, least_level, quantile_of_size
+from hil.studies.detectability.likelihood_ratio import RAISED, needed_noncentrality, probability_of_silence, threshold
 from hil.studies.detectability.model import DATA, whitened
 from hil.studies.detectability.signatures import NoSignatureError
 from hil.studies.detectability.uncertainty import Uncertainty
@@ -68,6 +68,31 @@ def test_the_quantile_of_a_size_is_that_of_draws(mean):
     drawn = np.linalg.norm(center + random.standard_normal((400_000, 3)) @ root.T, axis=1)
     found = quantile_of_size(center[None], (root @ root.T)[None])
     assert found[0] == pytest.approx(np.quantile(drawn, 0.999), rel=0.06)
+
+
+def test_a_level_of_the_least_size_covers_all_but_a_thousandth_with_the_best_test(short_model):
+    one = 0.35 * (three_axes() @ [0.0, 0.89, -0.46])[:, :, None]
+    found = whitened(short_model, one)
+    direction, estimates = found.innovations[:, :, 0], found.estimates[:, :3, 0]
+    noncentrality = np.cumsum(np.sum(direction**2, axis=1))
+    silence = probability_of_silence(noncentrality)
+    size = least_level(estimates, found.covariances[:, :3, :3], silence)
+    sound, _ = draw(short_model, 4000, 8)
+    data, poses = draw(short_model, 4000, 9)
+    told = whitened(short_model, data + one)
+    scale = np.sqrt(np.maximum(noncentrality, 1e-300))[:, None]
+    statistics = [
+        np.cumsum(np.einsum("ni,nic->nc", direction, each), axis=0) / scale
+        for each in (whitened(short_model, sound).innovations, told.innovations)
+    ]
+    there = noncentrality > 0.0
+    assert np.mean(statistics[0][there] > norm.isf(RAISED)) == pytest.approx(RAISED, rel=0.3)
+    silent = statistics[1] <= norm.isf(RAISED)
+    assert silent[there].mean(axis=1) == pytest.approx(silence[there], abs=0.025)
+    errors = np.linalg.norm(told.estimates[:, :3] - poses[:, :3], axis=1)
+    silent[~there] = np.random.default_rng(1).random(silent[~there].shape) > RAISED
+    assert np.mean(silent & (errors > size)) == pytest.approx(1e-3, rel=0.3)
+    assert np.mean(silent & (errors > 0.8 * size)) > 2e-3
 
 
 def bounds_of(*texts, begin=1.5, **changes):
