@@ -256,7 +256,7 @@ def cycle_parameters(
         platform=platform_filter.platform_parameters(fusion, rate, limits.jerk),
         heading=heading_filter.heading_parameters(fusion, rate, field, magnetometer),
         pose=pose_estimator.pose_parameters(fusion, section_5),
-        mechanism=trust.trust_parameters(fusion, rate, filtered),
+        mechanism=trust.trust_parameters(fusion, rate, filtered, bool(watched.watch_imus)),
         integrity=integrity.integrity_parameters(
             fusion, rate, prior, watch_evidence, base_imu.SHARED_NOISE if on_base else 1.0
         ),

@@ -8,6 +8,9 @@ backlash have, and is late for what is fast. A loop that is closed by a late pos
 closed form, moved by the step from there to the filter's pose, low-passed. It takes what is slow from the filter, and what is
 fast from the closed form. The low-pass is of second order and follows a step that grows steadily without lag. When the filter
 is not used, the step fades away.
+
+One gyroscope that is wrong can turn the filter's pose by half a degree in 0.2 s, about an axis about which the legs' directions
+hardly show it. The closed form knows that it is off by less. So the step is not longer than its covariance explains.
 """
 
 import numpy as np
@@ -25,7 +28,7 @@ from controller.estimation.whole_mechanism.filter import (
     start_lengths,
     step_filter,
 )
-from controller.estimation.whole_mechanism.parameters import FILTER_PARAMETERS, FILTER_STATE
+from controller.estimation.whole_mechanism.parameters import BLOCKS, FILTER_PARAMETERS, FILTER_STATE
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import factor_cholesky, invert_cholesky
 from controller.rig import elapsed
@@ -61,6 +64,9 @@ _MOST_DOUBLINGS = 10
 _BLENDING_S = 0.03
 """Time constant of the low-pass of the step from the pose in closed form to the filter's [s]."""
 
+_FARTHEST = 2.5
+"""Greatest length of that step, RMS over its components, in standard deviations of the closed form. Sound runs reach 1.4."""
+
 _FAST = 0.1
 """Share of the closed form's standard deviation that changes faster than this low-pass: 0.02 to 0.08 in the closed loop."""
 
@@ -73,6 +79,7 @@ PARAMETERS = record_dtype(
     disagreement=np.float64,  # of the leg filters with the filter, limit of the mean square [rad^2]
     known=np.float64,  # greatest variance of the filter's rotation with which it may be trusted [rad^2]
     smoothing=np.float64,  # share of a cycle's in that mean
+    farthest=np.float64,  # limit of the step's square by the closed form's covariance; infinite where that is too small
 )
 """Constants."""
 
@@ -96,9 +103,18 @@ STATE = record_dtype(
 """State of the filter and of the trust in it."""
 
 
-def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Record) -> Record:
-    """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz], around those of the filter itself."""
+def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Record, calibrated: bool = True) -> Record:
+    """The constants (dtype `PARAMETERS`), around those of the filter itself.
+
+    Args:
+        fusion: settings.
+        rate: [Hz].
+        filter_constants: of the filter.
+        calibrated: whether the errors of the IMUs are as small as the closed form's covariance says.
+    """
     few = filter_constants["start_share"] > _FEW_IMUS
+    # What encoders or the mountings tell moves the pose by more than the closed form knows.
+    more = filter_constants["lengths"] > 0 or filter_constants["errors"] > BLOCKS["accelerometers"]
     overconfidence = _OVERCONFIDENCE if few and filter_constants["lengths"] > 0 else 1.0
     return filled(
         PARAMETERS,
@@ -110,6 +126,7 @@ def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Reco
         disagreement=fusion.disagreement**2,
         known=(fusion.disagreement / overconfidence) ** 2,
         smoothing=1.0 / max(1.0, _AVERAGE_S * rate),
+        farthest=np.inf if few or more or not calibrated else 6.0 * _FARTHEST**2,
     )
 
 
@@ -181,6 +198,7 @@ def step_mechanism_filter(
             for part in range(2):
                 step = vector(s.step[3 * part :])
                 pose.apart[part] = np.sqrt(dot(step, step))
+            _shorten(s.step, pose.information, p.farthest)
         pose.position[:] = s.closed_position
         pose.rotation[:] = s.closed_rotation
         _correct(s, rig, time, pose)
@@ -257,6 +275,19 @@ def _find_step(position: Array, rotation: Array, new_position: Array, new_rotati
         for m in range(3):
             turn += 0.5 * (rotation[j, m] * new_rotation[k, m] - rotation[k, m] * new_rotation[j, m])
         step[3 + i] = turn
+
+
+@kernel
+def _shorten(step: Array, information: Array, most: float) -> None:
+    """Make a step (6,) no longer than its square may be with this information (6, 6), of which the lower triangle counts."""
+    squared = 0.0
+    for i in range(6):
+        for j in range(i + 1):
+            squared += (1.0 if i == j else 2.0) * step[i] * information[i, j] * step[j]
+    if squared > most:
+        share = np.sqrt(most / squared)
+        for i in range(6):
+            step[i] *= share
 
 
 @kernel
