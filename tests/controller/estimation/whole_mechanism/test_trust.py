@@ -12,7 +12,7 @@ from controller.safety.causes import Cause, Mode
 from controller.settings import SafetySettings, control_settings, fusion_settings
 from plant.encoders import load_encoder
 from plant.imu_wiring import ALL_IMUS
-from plant.pose import pose_errors
+from plant.pose import pose_errors, rotation_from_vector
 from tests.controller.cycles import cycle, run_stages
 from tests.controller.leg_geometry import leg_directions, rotation_of, static_signals
 
@@ -408,6 +408,40 @@ def test_the_covariance_is_the_filters_with_what_is_fast_in_the_closed_forms(hex
     stage.trust["trusted"] = 0
     find_covariance(p["mechanism"], stage.trust[()], p["rig"], stage.time[()], stage.pose[()], factor, found)
     assert np.isnan(found).all()
+
+
+@pytest.mark.parametrize(("sigmas", "kept"), [(0.5, 1.0), (2.4, 1.0), (5.0, 0.5), (50.0, 0.05)])
+def test_the_pose_is_no_farther_from_the_closed_form_than_its_covariance_explains(hexapod, sigmas, kept):
+    stage = Stage(hexapod, disagreement=1.0).trusted()
+    stage.parameters["mechanism"]["filter"]["variance"] = 1e30
+    random = np.random.default_rng(round(10 * sigmas))
+    root = np.diag([3e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-4]) @ (np.eye(6) + 0.3 * random.standard_normal((6, 6)))
+    direction = random.standard_normal(6)
+    off = sigmas * np.sqrt(6.0) * root @ (direction / np.linalg.norm(direction))
+    # Its upper triangle does not count.
+    stage.pose["information"] = np.tril(np.linalg.inv(root @ root.T)) + np.triu(np.full((6, 6), np.nan), 1)
+    f = stage.trust["filter"]
+    for position, rotation in (("position", "rotation"), ("published_position", "published_rotation")):
+        f[position] += off[:3]
+        f[rotation] = rotation_from_vector(off[3:]) @ f[rotation]
+    for _ in range(round(0.5 * RATE_HZ)):
+        stage.step()
+    found = pose_errors(stage.pose["position"], stage.pose["rotation"], stage.home.position, stage.home.rotation)
+    assert stage.trust["trusted"]
+    np.testing.assert_allclose(found, kept * off, rtol=0.02, atol=2e-3 * np.abs(off).max())
+    # The level counts how far apart the two estimates are.
+    np.testing.assert_allclose(stage.pose["apart"], np.linalg.norm(off.reshape(2, 3), axis=1), rtol=0.01)
+
+
+def test_the_closed_form_bounds_nothing_where_its_covariance_is_too_small(hexapod):
+    def limit(imus=ALL_IMUS, encoder=None, whole="accelerometers", **safety):
+        settings = control_settings(hexapod), fusion_settings(hexapod), imus, whole
+        parameters = cycle_parameters(hexapod, RATE_HZ, *settings, safety=SafetySettings(**safety), encoder=encoder)
+        return float(parameters["mechanism"]["farthest"])
+
+    assert limit() == limit(whole="gyroscopes") == limit(ALL_IMUS[1:]) == pytest.approx(6.0 * 2.5**2)
+    assert limit((1, 2, 3, 4)) == limit(encoder=load_encoder("incremental")) == limit(whole="alignments") == np.inf
+    assert limit(watch_imus=0.0) == np.inf
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.007])
