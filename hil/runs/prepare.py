@@ -163,15 +163,16 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
             watch_drives_alone(parameters)
         # Loads the planner, so that the planning time is that of the plan alone.
         plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
-        began = time.perf_counter()
+        planning_time = 0.0
         if config.streamed:
             lengths = leg_lengths(mechanism, target.start.position, target.start.rotation)
             reference = Reference(rest(lengths), 0)
         else:
-            checked = _checked(pickle.dumps((mechanism, target, config.duration, demands_of(config, mechanism))))
+            question = pickle.dumps((mechanism, target, config.duration, demands_of(config, mechanism)))
+            checked, planning_time = _checked(question)
             reference = checked.require_reachable(frames)
+            reference = replace(reference, segments=reference.segments.copy())
             remarks.append(checked.remark)
-        planning_time = time.perf_counter() - began
         # A plant can be started only at a pose that the plan has found within the strokes.
         plant = stack.enter_context(simulated_plant(config, nominal, target.start, fmu)) if config.rig == "fmu" else None
         loop = PreparedLoop(
@@ -197,9 +198,10 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
 
 
 @lru_cache(maxsize=2)
-def _checked(question: bytes) -> TargetCheck:
-    """The check of a pickled mechanism, target, duration and demands: runs of a study share it, and it takes long."""
-    return check_against_limits(*pickle.loads(question))
+def _checked(question: bytes) -> tuple[TargetCheck, float]:
+    """The check of a pickled mechanism, target, duration and demands, which runs of a study share, and what it took [s]."""
+    began = time.perf_counter()
+    return check_against_limits(*pickle.loads(question)), time.perf_counter() - began
 
 
 def demands_of(config: SimulationConfig, mechanism: Mechanism) -> Demands:

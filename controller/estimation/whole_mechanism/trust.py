@@ -9,8 +9,8 @@ closed form, moved by the step from there to the filter's pose, low-passed. It t
 fast from the closed form. The low-pass is of second order and follows a step that grows steadily without lag. When the filter
 is not used, the step fades away.
 
-One gyroscope that is wrong can turn the filter's pose by half a degree in 0.2 s, about an axis about which the legs' directions
-hardly show it. The closed form knows that it is off by less. So the step is not longer than its covariance explains.
+One IMU that is wrong can turn the filter's pose by 0.7 deg within 0.3 s, about an axis about which the legs' directions hardly
+show it. The closed form knows that it is off by less. So of the step no more is taken than its covariance explains.
 """
 
 import numpy as np
@@ -65,7 +65,7 @@ _BLENDING_S = 0.03
 """Time constant of the low-pass of the step from the pose in closed form to the filter's [s]."""
 
 _FARTHEST = 2.5
-"""Greatest length of that step, RMS over its components, in standard deviations of the closed form. Sound runs reach 1.4."""
+"""Most that is taken of that step, RMS over its components, in standard deviations of the closed form. Sound runs reach 1.4."""
 
 _FAST = 0.1
 """Share of the closed form's standard deviation that changes faster than this low-pass: 0.02 to 0.08 in the closed loop."""
@@ -79,7 +79,7 @@ PARAMETERS = record_dtype(
     disagreement=np.float64,  # of the leg filters with the filter, limit of the mean square [rad^2]
     known=np.float64,  # greatest variance of the filter's rotation with which it may be trusted [rad^2]
     smoothing=np.float64,  # share of a cycle's in that mean
-    farthest=np.float64,  # limit of the step's square by the closed form's covariance; infinite where that is too small
+    farthest=np.float64,  # most of the step's square by the closed form's covariance; infinite where that is too small
 )
 """Constants."""
 
@@ -91,7 +91,8 @@ STATE = record_dtype(
     disagreement=np.float64,  # of the leg filters with the filter, mean square [rad^2]
     stops=np.int64,  # how often that has stopped the filter
     step=(np.float64, 6),  # from the pose in closed form to the filter's [m, rad]
-    correction=(np.float64, 6),  # this step, low-passed, which moves the pose
+    taken=np.float64,  # share of this step that the closed form's covariance explains
+    correction=(np.float64, 6),  # this share, low-passed, which moves the pose
     growth=(np.float64, 6),  # of the step within `_BLENDING_S`
     alone=np.int64,  # whether the filter's pose was the only one
     closed_position=(np.float64, 3),  # of the pose in closed form [m]
@@ -103,18 +104,18 @@ STATE = record_dtype(
 """State of the filter and of the trust in it."""
 
 
-def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Record, calibrated: bool = True) -> Record:
+def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Record, bounded: bool) -> Record:
     """The constants (dtype `PARAMETERS`), around those of the filter itself.
 
     Args:
         fusion: settings.
         rate: [Hz].
         filter_constants: of the filter.
-        calibrated: whether the errors of the IMUs are as small as the closed form's covariance says.
+        bounded: whether the closed form bounds the filter's pose: not with raw IMUs, whose errors its covariance does not know.
     """
     few = filter_constants["start_share"] > _FEW_IMUS
-    # What encoders or the mountings tell moves the pose by more than the closed form knows.
-    more = filter_constants["lengths"] > 0 or filter_constants["errors"] > BLOCKS["accelerometers"]
+    # It may be far from the closed form, rightly, if it knows lengths, mountings or what the base's IMU reads wrong.
+    more = filter_constants["errors"] > BLOCKS["accelerometers"] or filter_constants["lengths"] + filter_constants["base"] > 0
     overconfidence = _OVERCONFIDENCE if few and filter_constants["lengths"] > 0 else 1.0
     return filled(
         PARAMETERS,
@@ -126,7 +127,7 @@ def trust_parameters(fusion: FusionSettings, rate: float, filter_constants: Reco
         disagreement=fusion.disagreement**2,
         known=(fusion.disagreement / overconfidence) ** 2,
         smoothing=1.0 / max(1.0, _AVERAGE_S * rate),
-        farthest=np.inf if few or more or not calibrated else 6.0 * _FARTHEST**2,
+        farthest=6.0 * _FARTHEST**2 if bounded and not few and not more else np.inf,
     )
 
 
@@ -198,12 +199,13 @@ def step_mechanism_filter(
             for part in range(2):
                 step = vector(s.step[3 * part :])
                 pose.apart[part] = np.sqrt(dot(step, step))
-            _shorten(s.step, pose.information, p.farthest)
+        s.taken = _share_within(s.step, pose.information, p.farthest) if s.trusted != 0 else 1.0
         pose.position[:] = s.closed_position
         pose.rotation[:] = s.closed_rotation
         _correct(s, rig, time, pose)
     else:
         s.alone = s.trusted
+        s.taken = 1.0
         if s.trusted == 0:
             return False
         for i in range(6):
@@ -225,16 +227,18 @@ def restart_filter(s: Record, time: Record) -> None:
 def find_covariance(p: Record, s: Record, rig: Record, time: Record, pose: Record, factor: Array, covariance: Array) -> None:
     """Write the pose's covariance (6, 6), NaN if there is none.
 
-    It is that of the refinement, or of a filter that is trusted, with what is fast in the refinement's.
+    It is that of the refinement, or of a filter that is trusted, with what the pose has of the refinement: what is fast, and
+    the share of the step that is not taken.
     """
     find_closed_covariance(pose, factor, covariance)
     if s.trusted == 0:
         return
     extrapolate_covariance(p.filter, s.filter, time.cycle * rig.period, factor)
+    share = _FAST**2 + (1.0 - s.taken) ** 2
     for i in range(6):
         for j in range(6):
-            fast = _FAST**2 * covariance[i, j]
-            covariance[i, j] = factor[i, j] + (fast if np.isfinite(fast) else 0.0)
+            closed = share * covariance[i, j]
+            covariance[i, j] = factor[i, j] + (closed if np.isfinite(closed) else 0.0)
 
 
 @kernel
@@ -258,7 +262,7 @@ def _correct(s: Record, rig: Record, time: Record, pose: Record) -> None:
         elif s.alone != 0:
             s.correction[i] = s.step[i]
         else:
-            left = s.step[i] - s.correction[i]
+            left = s.taken * s.step[i] - s.correction[i]
             s.growth[i] += share * left
             s.correction[i] += share * (left + s.growth[i])
     s.alone = 0
@@ -278,16 +282,16 @@ def _find_step(position: Array, rotation: Array, new_position: Array, new_rotati
 
 
 @kernel
-def _shorten(step: Array, information: Array, most: float) -> None:
-    """Make a step (6,) no longer than its square may be with this information (6, 6), of which the lower triangle counts."""
+def _share_within(step: Array, information: Array, most: float) -> float:
+    """The share of a step (6,) whose square by an information matrix (6, 6), of which the lower triangle counts, is `most`.
+
+    1 if that of the whole step is less, or not finite.
+    """
     squared = 0.0
     for i in range(6):
         for j in range(i + 1):
             squared += (1.0 if i == j else 2.0) * step[i] * information[i, j] * step[j]
-    if squared > most:
-        share = np.sqrt(most / squared)
-        for i in range(6):
-            step[i] *= share
+    return np.sqrt(most / squared) if squared > most else 1.0
 
 
 @kernel

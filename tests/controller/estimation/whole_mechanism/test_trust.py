@@ -367,7 +367,8 @@ def test_without_a_pose_in_closed_form_the_trusted_filters_pose_goes_on_and_anot
         assert stage.step(found=False, closed=np.nan)
         assert stage.stands == (True, True)
         np.testing.assert_allclose(stage.pose["position"], stage.home.position, rtol=0.0, atol=1e-6)
-    # Once there is one again, the pose goes on from the filter's.
+    # Once there is one again, the pose goes on from the filter's, even if it is 5 standard deviations away.
+    stage.pose["information"] = 1.5e8 * np.eye(6)
     assert stage.step(closed=stage.home.position + [1e-3, 0.0, 0.0])
     np.testing.assert_allclose(stage.pose["position"], stage.home.position, rtol=0.0, atol=1e-6)
     # A filter that is no longer finite is not trusted either, and what is not finite does not stay in the pose.
@@ -411,7 +412,7 @@ def test_the_covariance_is_the_filters_with_what_is_fast_in_the_closed_forms(hex
 
 
 @pytest.mark.parametrize(("sigmas", "kept"), [(0.5, 1.0), (2.4, 1.0), (5.0, 0.5), (50.0, 0.05)])
-def test_the_pose_is_no_farther_from_the_closed_form_than_its_covariance_explains(hexapod, sigmas, kept):
+def test_the_pose_takes_no_more_of_the_step_to_the_filters_than_the_closed_forms_covariance_explains(hexapod, sigmas, kept):
     stage = Stage(hexapod, disagreement=1.0).trusted()
     stage.parameters["mechanism"]["filter"]["variance"] = 1e30
     random = np.random.default_rng(round(10 * sigmas))
@@ -429,6 +430,11 @@ def test_the_pose_is_no_farther_from_the_closed_form_than_its_covariance_explain
     found = pose_errors(stage.pose["position"], stage.pose["rotation"], stage.home.position, stage.home.rotation)
     assert stage.trust["trusted"]
     np.testing.assert_allclose(found, kept * off, rtol=0.02, atol=2e-3 * np.abs(off).max())
+    p, factor, covariance, own = stage.parameters, np.zeros((6, 6)), np.zeros((6, 6)), np.zeros((6, 6))
+    extrapolate_covariance(p["mechanism"]["filter"], f[()], stage.time["cycle"] / RATE_HZ, own)
+    find_covariance(p["mechanism"], stage.trust[()], p["rig"], stage.time[()], stage.pose[()], factor, covariance)
+    expected = np.tril((0.1**2 + (1.0 - kept) ** 2) * root @ root.T)
+    np.testing.assert_allclose(np.tril(covariance - own), expected, rtol=0.03, atol=1e-3 * np.abs(expected).max())
     # The level counts how far apart the two estimates are.
     np.testing.assert_allclose(stage.pose["apart"], np.linalg.norm(off.reshape(2, 3), axis=1), rtol=0.01)
 
