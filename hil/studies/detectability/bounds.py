@@ -155,9 +155,9 @@ def _bound(found: Whitened, data: Array, column: int, run: Disturbed) -> Bound:
 def least_level(means: Array, covariances: Array, silence: Array) -> float:
     """The size that a protection level must have at least to be above the error in a share `POWER` of the steps.
 
-    Whatever a level is computed from, it is beyond this size in a share `RAISED` of the time without a fault, so that "it is
-    beyond" is a test, which is silent with the probability `silence` (N,) at each step at least. The error, of mean (N, 3) and
-    covariance (N, 3, 3), does not depend on the data, as the estimate is the best one. 0 if the test hardly ever is silent.
+    Without a fault, the level is beyond this size with the probability `RAISED` at each step. So "it is beyond" is a test,
+    and silent with the probability `silence` (N,) at least, whatever the level makes of the data. The error of the best
+    estimate, of mean (N, 3) and covariance (N, 3, 3), does not depend on the data. 0 if the test is hardly ever silent.
     """
 
     def uncovered(size: float) -> float:

@@ -11,7 +11,7 @@ EVALUATIONS_HZ = 10.0
 POWER = 0.999
 
 RAISED = 0.01
-"""Share of the time without a fault in which a protection level may be beyond the size that is stated of it."""
+"""With what probability a protection level may be beyond the size in question at any time, without a fault."""
 
 HYPOTHESES = 65
 """Over which the false alarms are shared: of each IMU its gyroscope, its accelerometer, both, and its mounting (28); pairs of
@@ -36,8 +36,9 @@ def needed_noncentrality(dimensions: int, hypotheses: int = HYPOTHESES) -> float
 
 
 def probability_of_silence(noncentrality: Array) -> Array:
-    """With what probability a test that speaks in a share `RAISED` of the time without a fault is silent, if it knows what the
-    fault is: by Neyman and Pearson no test is silent less often.
+    """How often a test is silent that knows what the fault is, and without one speaks with the probability `RAISED`.
+
+    By Neyman and Pearson no such test is silent less often.
 
     Args:
         noncentrality: of the fault, any shape.

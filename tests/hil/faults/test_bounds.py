@@ -99,6 +99,11 @@ def test_a_row_that_is_never_told_says_so():
     assert table(found).rows[0][1].text == "never"
 
 
+def test_the_level_and_how_many_times_the_error_it_is_end_the_line():
+    row = RowBounds(row_of(TILT), False, (bound_of(1e-3, 0.01), bound_of(2e-3, 0.005)))
+    assert [cell.text for cell in table([row]).rows[0]][-2:] == ["6.00/1.72", "3.0/3.0"]
+
+
 def test_the_command_prints_writes_and_judges(tmp_path, capsys):
     row = row_of(TILT)
     path, runs = tmp_path / "bounds.json", tmp_path / "faults.json"

@@ -123,6 +123,19 @@ def test_what_seven_imus_share_is_told_later_than_what_one_has_and_bends_the_pos
 def test_a_joint_that_is_off_from_the_start_counts_from_the_start():
     found = find_bounds([Disturbed(SimulationConfig(target="sines", duration=6.0, joint_error=1e-3), (), 0.0)], Uncertainty())
     assert found[0].told_after >= 0.0 and found[0].share > 0.5
+    # It is told while the platform still stands, so that no level is needed in motion.
+    assert found[0].level_position == found[0].level_rotation == 0.0
+
+
+def test_joints_that_are_off_a_little_need_a_higher_level_than_nothing_at_all():
+    none, off = (
+        find_bounds([Disturbed(SimulationConfig(target="sines", duration=6.0, joint_error=size), (), 0.0)], Uncertainty())[0]
+        for size in (1e-9, 2e-4)
+    )
+    assert off.level_position > 1.05 * none.level_position and off.level_rotation > 1.01 * none.level_rotation
+    assert 1e-4 < none.sound_position == off.sound_position < 1e-3 < none.sound_rotation < 3e-3
+    assert 2.5 < none.level_position / none.sound_position < 5.0
+    assert 2.5 < none.level_rotation / none.sound_rotation < 5.0
 
 
 def test_what_has_no_signature_or_cannot_be_linearised_is_refused():
