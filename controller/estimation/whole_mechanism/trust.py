@@ -10,7 +10,7 @@ fast from the closed form. The low-pass is of second order and follows a step th
 is not used, the step fades away.
 
 One IMU that is wrong can turn the filter's pose by 0.7 deg within 0.3 s, about an axis about which the legs' directions hardly
-show it. The closed form knows that it is off by less. So of the step no more is taken than its covariance explains.
+show it. The closed form is off by less. So the pose takes no more of the step than the closed form's covariance explains.
 """
 
 import numpy as np
@@ -65,7 +65,9 @@ _BLENDING_S = 0.03
 """Time constant of the low-pass of the step from the pose in closed form to the filter's [s]."""
 
 _FARTHEST = 2.5
-"""Most that is taken of that step, RMS over its components, in standard deviations of the closed form. Sound runs reach 1.4."""
+"""The most of that step that the pose takes, in standard deviations of the closed form, RMS over its six components. Sound runs
+reach 1.4.
+"""
 
 _FAST = 0.1
 """Share of the closed form's standard deviation that changes faster than this low-pass: 0.02 to 0.08 in the closed loop."""
@@ -79,7 +81,7 @@ PARAMETERS = record_dtype(
     disagreement=np.float64,  # of the leg filters with the filter, limit of the mean square [rad^2]
     known=np.float64,  # greatest variance of the filter's rotation with which it may be trusted [rad^2]
     smoothing=np.float64,  # share of a cycle's in that mean
-    farthest=np.float64,  # most of the step's square by the closed form's covariance; infinite where that is too small
+    farthest=np.float64,  # limit of the step's square by the closed form's information; infinite where it has no limit
 )
 """Constants."""
 
