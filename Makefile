@@ -11,11 +11,12 @@ comma := ,
 # Without Python's bytecode each of some hundred processes of the tests, and each worker at each collection, compiles all modules.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Installs with pip, and says every ten seconds that it goes on.
+# Installs with pip, says every ten seconds that it goes on, and notes what is there now.
 define install
 @echo "Installing $(1) into .venv, once; all that a first run needs takes 1.1 GB and some minutes."
 @( for ((s = 10; ; s += 10)); do sleep 10 >/dev/null 2>&1 </dev/null; echo "  still installing: $$s s"; done ) & \
 	clock=$$!; trap "kill $$clock" EXIT; $(BIN)/pip install --quiet --constraint constraints.txt --editable '$(1)'
+@touch $(2)
 endef
 
 .PHONY: demo test test-all test-endurance bench bench-loop bench-fusion bench-faults lint docs docs-links clean
@@ -71,7 +72,7 @@ docs-links: .venv/installed-docs
 clean:
 	rm -rf .venv build dist $(OUT) *.egg-info
 
-.venv/installed: pyproject.toml constraints.txt
+.venv/bin/pip:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
 		{ echo "gough needs Python 3.11 or newer as '$(PYTHON)': install it, or run 'make PYTHON=/path/to/python3.11'"; exit 1; }
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
@@ -79,21 +80,17 @@ clean:
 	@command -v cc >/dev/null || command -v gcc >/dev/null || command -v clang >/dev/null || \
 		{ echo "a C compiler is missing (it builds the plant): install one, on Debian with 'apt install gcc libc6-dev'"; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(call install,.[reports])
-	@touch $@
 
-.venv/installed-all: .venv/installed
-	$(call install,.[all])
-	@touch $@
-
-.venv/installed-test: .venv/installed-all
-	$(call install,.[test])
-	@touch $@
-
-.venv/installed-lint: .venv/installed-test
-	$(call install,.[test$(comma)lint])
-	@touch $@
-
-.venv/installed-docs: .venv/installed-all
-	$(call install,.[docs])
-	@touch $@
+# Each of these has all of those above it, so that whoever needs the last calls pip once.
+INSTALLED := .venv/installed
+$(INSTALLED) $(INSTALLED)-all $(INSTALLED)-docs $(INSTALLED)-test $(INSTALLED)-lint: pyproject.toml constraints.txt | .venv/bin/pip
+$(INSTALLED):
+	$(call install,.[reports],$@)
+$(INSTALLED)-all:
+	$(call install,.[all],$(INSTALLED) $@)
+$(INSTALLED)-docs:
+	$(call install,.[docs],$(INSTALLED) $(INSTALLED)-all $@)
+$(INSTALLED)-test:
+	$(call install,.[test],$(INSTALLED) $(INSTALLED)-all $(INSTALLED)-docs $@)
+$(INSTALLED)-lint:
+	$(call install,.[test$(comma)lint],$(INSTALLED) $(INSTALLED)-all $(INSTALLED)-docs $(INSTALLED)-test $@)

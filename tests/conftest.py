@@ -13,7 +13,7 @@ from tests.plant.fmu.foreign import build_foreign, build_foreign_3
 
 # The first example of a property may compile kernels, so there is no deadline; and the same examples come every time.
 # `make test` takes fewer of them than the slow and the weekly tests, which say `--hypothesis-profile=all`.
-settings.register_profile("few", deadline=None, derandomize=True, max_examples=30)
+settings.register_profile("few", deadline=None, derandomize=True, max_examples=20)
 settings.register_profile("all", deadline=None, derandomize=True)
 settings.load_profile("few")
 

@@ -38,15 +38,5 @@ def test_the_page_runs_as_one_script(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("mypy") is None, reason="mypy is for who changes gough")
 def test_the_page_passes_strict_type_checks(tmp_path):
-    lenient = "--disable-error-code=type-arg"  # the page writes np.ndarray
-    cache = f"--cache-dir={tmp_path}"
-    run(
-        tmp_path,
-        "-m",
-        "mypy",
-        "--strict",
-        lenient,
-        cache,
-        f"--config-file={ROOT / 'pyproject.toml'}",
-        str(script(tmp_path, SNIPPETS)),
-    )
+    # The page writes np.ndarray. Said in the file, this leaves what `make lint` has found of all other files as it is.
+    run(ROOT, "-m", "mypy", "--strict", str(script(tmp_path, ['# mypy: disable-error-code="type-arg"', *SNIPPETS])))

@@ -4,6 +4,8 @@ import re
 import shlex
 from pathlib import Path
 
+import pytest
+
 from hil.command_line import parse
 
 PAGE = (Path(__file__).parent.parent / "docs" / "tuning.md").read_text()
@@ -16,6 +18,7 @@ def test_the_commands_are_parsed() -> None:
         parse(words)
 
 
+@pytest.mark.slow
 def test_the_example_runs(capsys) -> None:
     (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     exec(compile(example, "docs/tuning.md", "exec"), {})

@@ -21,6 +21,7 @@ def rows_of(heading: str) -> dict[str, list[str]]:
     return {row[0]: row[1:] for row in cells}
 
 
+@pytest.mark.slow
 def test_the_figures_are_those_of_the_command(tmp_path):
     (line,) = re.findall(r"^gough workspace .*--picture", PAGE, re.MULTILINE)
     arguments = shlex.split(line.replace("docs/", f"{ROOT / 'docs'}/"))[1:-1]

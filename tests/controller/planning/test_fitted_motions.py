@@ -27,9 +27,8 @@ BEFORE = {
 @pytest.mark.parametrize(
     "preset",
     [
-        "hexapod",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("6-5", "planar-3rpr")),
-        *(pytest.param(name, marks=pytest.mark.endurance) for name in BEFORE if name not in ("hexapod", "6-5", "planar-3rpr")),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("hexapod", "planar-3rpr")),
+        *(pytest.param(name, marks=pytest.mark.endurance) for name in BEFORE if name not in ("hexapod", "planar-3rpr")),
     ],
 )
 def test_the_motions_of_presets_are_what_they_were(preset: str) -> None:

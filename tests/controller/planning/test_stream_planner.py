@@ -131,9 +131,8 @@ def displacements(random, kind, count):
 @pytest.mark.parametrize(
     "kind",
     [
-        "steps",
-        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("waves", "ramps")),
-        *(pytest.param(kind, marks=pytest.mark.endurance) for kind in ("leaps", "noise")),
+        *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("steps", "waves")),
+        *(pytest.param(kind, marks=pytest.mark.endurance) for kind in ("ramps", "leaps", "noise")),
     ],
 )
 @given(seed=st.integers(0, 2**32 - 1))

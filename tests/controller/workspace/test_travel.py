@@ -66,7 +66,12 @@ def _kept(mechanism: Mechanism, demands: Demands, row: int) -> bool:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) for name in LIMITED if name != "planar-3rpr"] + ["planar-3rpr"]
+    "name",
+    [
+        "planar-3rpr",
+        pytest.param("hexapod", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.endurance) for name in LIMITED if name not in ("planar-3rpr", "hexapod")),
+    ],
 )
 def test_travel_ends_where_fine_steps_do(name):
     assert len(check_travel(name, 4, 100, starts=2)) >= 2

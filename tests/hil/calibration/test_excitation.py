@@ -112,9 +112,14 @@ def swinging(swing: float, **changes: float) -> Mechanism:
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("box", [EVERYWHERE, Box(0.05, radians(15.0))], ids=["everywhere", "box"])
-@pytest.mark.parametrize("swing", [0.3, 0.15])
+@pytest.mark.parametrize(
+    ("swing", "box"),
+    [
+        pytest.param(0.15, Box(0.05, radians(15.0)), marks=pytest.mark.slow),
+        pytest.param(0.3, Box(0.05, radians(15.0)), marks=pytest.mark.endurance),
+        *(pytest.param(swing, EVERYWHERE, marks=pytest.mark.endurance) for swing in (0.15, 0.3)),
+    ],
+)
 def test_what_is_planned_stays_within_swings_and_clearances(swing: float, box: Box) -> None:
     mechanism = swinging(swing)
     free = load_spatial("hexapod")

@@ -87,6 +87,7 @@ def test_the_first_step_moves_nothing_and_a_failed_one_is_kept_and_gone_on_from(
     assert any("step 1 of 6 was done" in line for line in again.told)
 
 
+@pytest.mark.slow
 def test_it_does_not_go_on_blindly_from_another_place(plan, tmp_path: Path) -> None:
     output, moved = tmp_path / "rig.toml", Bench(plan.mechanism)
     with pytest.raises(FailedCalibrationError):

@@ -90,7 +90,6 @@ def test_what_it_says_of_itself_without_the_truth_is_honest(calibrated):
 
 
 @pytest.mark.endurance
-@pytest.mark.endurance
 def test_recordings_tell_the_same_and_known_poses_less(recorded):
     files = [recorded / "shaking.mcap", recorded / "rests.mcap"]
     summary = calibrate_recordings(files).summary
@@ -124,7 +123,7 @@ def test_recordings_that_do_not_suffice_are_refused(recorded, tmp_path, capsys):
     assert "give recordings of one rig" in refusal(rests, str(other))
 
 
-@pytest.mark.slow
+@pytest.mark.endurance
 def test_recordings_without_the_truth_suffice(recorded, tmp_path, capsys):
     blind, shaking = (str(recorded / f"{name}.mcap") for name in ("blind", "shaking"))
     assert main(["calibrate", "rig", str(tmp_path / "c.toml"), "--recording", blind, shaking]) == 0

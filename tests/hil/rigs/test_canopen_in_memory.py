@@ -125,9 +125,9 @@ def moving(made):
     return make
 
 
-@pytest.mark.parametrize("fd", [True, False])
-@pytest.mark.parametrize("lengths", ["none", "ideal"])
-@pytest.mark.parametrize("signs", [[1] * 6, [-1, 1] * 3])
+@pytest.mark.parametrize(
+    ("fd", "lengths", "signs"), [(True, "none", [1] * 6), (False, "ideal", [-1, 1] * 3), (True, "ideal", [1] * 6)]
+)
 def test_drives_that_are_told_positions_do_not_droop(moving, fd, lengths, signs):
     rig, first = moving(fd=fd, lengths=lengths, signs=signs)
     assert {drive.value(Object.MODE) for drive in rig.nodes.drives} == {8}

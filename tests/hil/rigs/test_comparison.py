@@ -55,7 +55,13 @@ def examined(**wrong):
 
 @pytest.mark.parametrize(
     "rig",
-    [{}, {"imu": "mpu9150", "seed": 1}, {"imu": "ideal"}, {"start": np.array([5, -5, 8, -8, 5, -5]) * 1e-3}, {"command": 1.3}],
+    [
+        {"imu": "mpu9150", "seed": 1},
+        *(
+            pytest.param(each, marks=pytest.mark.slow)
+            for each in ({}, {"imu": "ideal"}, {"start": np.array([5, -5, 8, -8, 5, -5]) * 1e-3}, {"command": 1.3})
+        ),
+    ],
 )
 def test_a_sound_rig_has_no_findings(rig):
     found, made = examined(**rig)

@@ -208,8 +208,12 @@ def test_differences_and_ratios_are_to_the_reference(folder):
 
 
 def test_what_limits_the_comparison_is_said(compared, folder):
-    assert compared.remarks == (
-        "recordings are compared over the 0.600 s of motion that all runs share; long.mcap has 1.000 s",
+    # A busy machine may miss the last periods.
+    told = re.fullmatch(
+        r"recordings are compared over the (\S+) s of motion that all runs share; long\.mcap has (\S+) s", compared.remarks[0]
+    )
+    assert told and [*map(float, told.groups())] == pytest.approx([0.6, 1.0], abs=0.05)
+    assert compared.remarks[1:] == (
         "the figures of long.json are of its whole motion of 1.000 s, and cannot be cut",
         "the figures of simulated.json are of its whole motion of 1.000 s, and cannot be cut",
         "the times, missed periods and protection level of long.json are of the whole run, with the hold",

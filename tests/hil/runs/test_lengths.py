@@ -18,6 +18,10 @@ from plant.truth import TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
 SINES = SimulationConfig(target="sines", duration=20.0, fusion="whole", lengths="incremental")
 
 
+WRONG = ("jumps:2,size_mm=2", "canopen"), ("frozen:2", "udp")
+"""Encoders' faults, and links, beside those in the plant itself; the others take as long."""
+
+
 def errors_of(records):
     """Errors of the pose in motion (N, 6) [mm, deg]."""
     records = records[records["mode"] == Mode.RUNNING]
@@ -59,9 +63,14 @@ def test_at_power_on_the_pose_is_known_without_homing(seed):
         assert 1e3 * position[cycle] < most and np.degrees(rotation[cycle]) < turned
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("link", ["fmu", "udp", "canopen"])
-@pytest.mark.parametrize("fault", ["jumps:2,size_mm=2", "reversed:2", "slips:2,size_percent=20", "frozen:2"])
+@pytest.mark.parametrize(
+    ("fault", "link"),
+    [
+        pytest.param(fault, link, marks=pytest.mark.slow if (fault, link) in WRONG or link == "fmu" else pytest.mark.endurance)
+        for link in ("fmu", "udp", "canopen")
+        for fault in ("jumps:2,size_mm=2", "reversed:2", "slips:2,size_percent=20", "frozen:2")
+    ],
+)
 def test_an_encoder_that_is_wrong_is_named_and_left_out(fault, link):
     """Before it is 1 mm off or within 50 ms, whichever is later; the pose is hardly moved."""
     begin, text = 3.0, f"encoder-{fault},at=3"
@@ -110,12 +119,9 @@ def test_lost_answers_move_neither_the_pose_nor_the_commands(changes):
 def test_an_encoder_that_agrees_again_is_used_again(lengths, fault):
     """One that has lost counts, with a new zero, and an absolute one that stood still, with its own."""
     result = simulate(replace(SINES, lengths=lengths, duration=16.0, fusion="compiled", faults=(fault,)))
-    told = [
-        (Cause(int(cause)), int(index))
-        for row, indices in zip(result.records["event_cause"], result.records["event_index"], strict=True)
-        for cause, index in zip(row, indices, strict=True)
-        if cause in (Cause.ENCODER_CONTRADICTED, Cause.ENCODER_BACK)
-    ]
+    causes, indices = result.records["event_cause"], result.records["event_index"]
+    of_encoders = np.isin(causes, (Cause.ENCODER_CONTRADICTED, Cause.ENCODER_BACK))
+    told = list(zip(causes[of_encoders], indices[of_encoders], strict=True))
     assert told == [(Cause.ENCODER_CONTRADICTED, 4), (Cause.ENCODER_BACK, 4)]
     assert np.linalg.norm(errors_of(result.records)[-500:, :3], axis=1).max() < 0.6
 

@@ -71,7 +71,7 @@ def without_times(figures):
 @pytest.mark.parametrize(
     "study",
     [
-        *(pytest.param(name, marks=pytest.mark.slow) if name == "faults" else name for name in STUDIES),
+        *(pytest.param(name, marks=pytest.mark.slow) if name in ("faults", "sensor-sets") else name for name in STUDIES),
         *(pytest.param(n, marks=pytest.mark.slow if n == "tune-fusion" else pytest.mark.endurance) for n in LONG_STUDIES),
     ],
 )

@@ -431,6 +431,7 @@ def test_ideal_imu_signals_are_derivatives_of_the_trajectory(hexapod: Mechanism,
     np.testing.assert_allclose(signals["magnetic_field"], to_sensor @ p["magnetic_field"], rtol=0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_ten_seconds_of_motion_are_within_a_tenth_of_a_micrometre_of_fine_substeps(make_plant: MakePlant) -> None:
     def ends(substep: float) -> Array:
         plant = make_plant({"substep": substep})

@@ -41,7 +41,7 @@ def positions_at_rest(hexapod, errors, minutes, seed):
 @pytest.mark.parametrize(
     ("errors", "minutes", "seed"),
     [
-        ("alignments", 1.0, 3),
+        ("alignments", 0.5, 3),
         pytest.param("accelerometers", 4.0, 5, marks=pytest.mark.slow),
         pytest.param("alignments", 20.0, 4, marks=pytest.mark.endurance),
         pytest.param("accelerometers", 20.0, 5, marks=pytest.mark.endurance),
