@@ -9,9 +9,10 @@ information form: Y x = y for x = (m, f), which begins with nothing known. Of a 
     update   Y <- Y + H^T R^-1 H, y <- y + H^T R^-1 z       z: mean reading less what the loop's pose predicts; H = (J, 1)
 
 so that Y and y hold what the last half second says about f, and how much the pose depends on that. A window that a missed
-period interrupts is dropped: Y and y are carried over it, and the jerk in it is not known at all. No other part of the loop
-uses this filter's estimate, so that no fault of its own can bend the pose. The work of a window is spread over the cycles of
-the next one.
+period interrupts is dropped: Y and y are carried over it. The drives held their rates in it, and then catch up. So rates and
+accelerations may have jumped, by as much as feedback has changed, and for some windows nothing is known of the jerk. No other
+part of the loop uses this filter's estimate, so that no fault of its own can bend the pose. The work of a window is spread over
+the cycles of the next one.
 """
 
 import numpy as np
@@ -60,6 +61,14 @@ _TIMING_S = 3e-4
 _BRIDGED_WINDOWS = 3
 """How much time between two windows may be lost by missed periods [windows]: a longer gap ends in a new beginning."""
 
+_CATCHING_UP = 5
+"""Windows from a missed period on in which drives may catch up: no plan has that jerk."""
+
+_JUMPS = 5.0, 30.0
+"""How far the platform's velocity and rate may jump over missed periods, as a multiple of the greatest change of a leg's
+feedback [-, rad/m]: drives hold their rates, and then catch up by a step.
+"""
+
 _JERKS, _NEXT = 6, 3
 _FAULT_STIFFNESS = 1e-4
 """How well the fault of an IMU that has been left out is known from the window before: the variance of a window's mean,
@@ -93,6 +102,7 @@ STATE = record_dtype(
     step=np.int64,  # cycles since that window was full
     collected=np.int64,  # cycles in the present window
     lost=np.int64,  # cycles since the last full window that are in no window
+    unsettled=np.int64,  # windows in which drives still catch up with missed periods
     between=np.float64,  # time between the middles of the last two full windows [s]
     follows=np.int64,  # whether the last full window directly follows the one before
     sum=(np.float64, (IMU_COUNT, READINGS)),  # of their samples
@@ -101,6 +111,7 @@ STATE = record_dtype(
     feedback=(np.float64, LEGS),  # what feedback adds to the planned rate of each leg, sum [m/s]
     feedback_before=(np.float64, LEGS),  # its mean in the last full window [m/s]
     samples=(np.int64, IMU_COUNT),
+    jumped=np.float64,  # greatest change of it since the window before [m/s]
     acceleration=(np.float64, LEGS),  # of the legs at the end of the last window
     next_path=PATH,  # in the middle of the present window
     arms=(np.float64, (LEGS, 3)),  # of the legs then, as their directions and lengths
@@ -191,6 +202,7 @@ def bridge_gap(p: Record, s: Record, missed: int) -> bool:
     """Leave out the window under way, as periods were missed; returns whether what was read before them still counts."""
     s.lost = s.lost + s.collected + missed if s.windows > 0 else missed
     s.collected = 0
+    s.unsettled = _CATCHING_UP
     return bool(s.lost <= _BRIDGED_WINDOWS * p.window)
 
 
@@ -249,7 +261,7 @@ def _find_motion(s: Record) -> None:
 def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: Array) -> None:
     """Keep the full window for its jobs, and find how far the loop's pose has left its path."""
     _find_motion(s)
-    fastest, change, turning, corrected = 0.0, 0.0, 0.0, 0.0
+    fastest, change, turning, jumped = 0.0, 0.0, 0.0, 0.0
     for i in range(3):
         turning += s.next_path.motion[ANGULAR_ACCELERATION, i] ** 2
     turning = np.sqrt(turning)
@@ -259,10 +271,11 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         change = max(change, abs(legs[k, 2] - s.acceleration[k]))
         s.acceleration[k] = legs[k, 2]
         feedback = s.feedback[k] / s.collected
-        corrected = max(corrected, abs(feedback - s.feedback_before[k]) / p.duration)
+        jumped = max(jumped, abs(feedback - s.feedback_before[k]))
         s.feedback_before[k] = feedback
     s.turning = turning
-    corrected = max(corrected - _STEADY_FEEDBACK, 0.0)
+    s.jumped = jumped
+    corrected = max(jumped / p.duration - _STEADY_FEEDBACK, 0.0)
     s.rough = np.sqrt((p.ripple * fastest) ** 2 + (_TIMING_S / p.duration * change) ** 2)
     for k in range(IMU_COUNT):
         # Samples from one side of the window would not be its mean.
@@ -282,6 +295,7 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
     s.follows = s.windows > 0 and s.lost == 0
     s.between = p.duration * (1.0 + s.lost / p.window if s.windows > 0 else 1.0)
     s.lost = 0
+    s.unsettled = max(s.unsettled - 1, 0)
     if s.windows > 0:
         _find_shift(s.between, s.path, s.next_path, s.turn, s.shift)
     s.path.position[:] = s.next_path.position
@@ -378,22 +392,34 @@ def _forget(p: Record, s: Record, information: Array, vector: Array) -> None:
     for n in range(_JERKS):
         for m in range(_JERKS):
             s.factor[n, m] = by_place * z[n, m] + by_speed * z[n, 6 + m] + t * z[n, 12 + m]
-        # In missed periods drives hold their rates, and then catch up: no plan has that jerk.
-        s.factor[n, n] += p.stiffness[n // 3] if t == p.duration else 0.0
+        # While drives catch up with missed periods no plan has that jerk.
+        s.factor[n, n] += p.stiffness[n // 3] if s.unsettled == 0 else 0.0
     _take_away(s, information, vector, p.keep ** (t / p.duration))
+    if s.follows == 0 and s.jumped > 0.0:
+        for first, per in ((6, 1.0), (12, p.duration)):
+            _take_rows(s, first, information, vector)
+            for n in range(_JERKS):
+                s.factor[n, n] += (per / (_JUMPS[n // 3] * s.jumped)) ** 2
+            _take_away(s, information, vector, 1.0)
 
 
 @kernel
 def _forget_fault(p: Record, s: Record, k: int, information: Array, vector: Array) -> None:
     """Let what IMU `k` reads wrong change freely between windows."""
-    first = MOTION_STATES + READINGS * k
+    _take_rows(s, MOTION_STATES + READINGS * k, information, vector)
     for n in range(READINGS):
-        s.root[n] = information[first + n]
-        s.root_vector[n] = vector[first + n]
-        for m in range(READINGS):
-            s.factor[n, m] = s.root[n, first + m]
         s.factor[n, n] += _FAULT_STIFFNESS * s.weight[k, n // 3]
     _take_away(s, information, vector, 1.0)
+
+
+@kernel
+def _take_rows(s: Record, first: int, information: Array, vector: Array) -> None:
+    """Prepare to take away what is known of six unknowns from `first` on."""
+    for n in range(_JERKS):
+        s.root[n] = information[first + n]
+        s.root_vector[n] = vector[first + n]
+        for m in range(_JERKS):
+            s.factor[n, m] = s.root[n, first + m]
 
 
 @kernel
