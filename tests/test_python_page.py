@@ -38,5 +38,5 @@ def test_the_page_runs_as_one_script(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("mypy") is None, reason="mypy is for who changes gough")
 def test_the_page_passes_strict_type_checks(tmp_path):
-    # The page writes np.ndarray. Said in the file, this leaves what `make lint` has found of all other files as it is.
+    # The page writes np.ndarray. An option would make mypy check all other files again; a comment in the file does not.
     run(ROOT, "-m", "mypy", "--strict", str(script(tmp_path, ['# mypy: disable-error-code="type-arg"', *SNIPPETS])))

@@ -131,7 +131,7 @@ def test_the_period_of_the_samples_does_not_matter(hexapod):
 # ------------------------------------------------------------------------------------------------------------------ physics
 
 
-@settings(max_examples=10)
+@settings(max_examples=20)
 @given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
 def test_what_lasts_is_felt_as_gravity_and_the_platform_comes_back(hexapod, along, across):
     """The tilt's gravity is the scaled acceleration, to where it is too steep, with the platform back in the middle."""
@@ -297,7 +297,7 @@ def check_stream(data):
             planner.follow(plan)
 
 
-@settings(max_examples=1)
+@settings(max_examples=2)
 @given(st.data())
 def test_a_streamed_cue_is_never_refused_and_no_limit_is_left(data):
     check_stream(data)

@@ -32,7 +32,7 @@ OF_EACH_KIND = (
     "the platform's IMU is dead", "two IMUs are biased by 2 deg", "10 % of the packets are damaged", "a drive runs away",
     "the payload gains 5 kg", "20 periods are missed",
 )  # fmt: skip
-"""The others take minutes, and `make bench-faults` has them too."""
+"""The others are endurance tests: together they take minutes."""
 
 
 @pytest.mark.parametrize(

@@ -343,7 +343,7 @@ def test_loops_of_other_imus_record_what_the_cycle_was_given():
     ],
 )
 def test_a_machine_that_misses_periods_now_and_then_is_no_contradiction(fusion, seed):
-    """The drives catch up after each of a hundred gaps; one run in twelve ended, as no plan has such a motion."""
+    """The drives catch up after each of about a hundred gaps, with a motion that no plan has: this is no fault."""
     with prepared_loop(replace(CONFIG, fusion=fusion, seed=seed)) as loop:
         loop.most_missed = 1000
         assert scripted(loop, missed_now_and_then(seed)).run(2200) == Cause.NONE

@@ -126,7 +126,14 @@ def moving(made):
 
 
 @pytest.mark.parametrize(
-    ("fd", "lengths", "signs"), [(True, "none", [1] * 6), (False, "ideal", [-1, 1] * 3), (True, "ideal", [1] * 6)]
+    ("fd", "lengths", "signs"),
+    # Every two of these choices meet once.
+    [
+        (True, "none", [1] * 6),
+        (True, "ideal", [-1, 1] * 3),
+        (False, "none", [-1, 1] * 3),
+        (False, "ideal", [1] * 6),
+    ],
 )
 def test_drives_that_are_told_positions_do_not_droop(moving, fd, lengths, signs):
     rig, first = moving(fd=fd, lengths=lengths, signs=signs)

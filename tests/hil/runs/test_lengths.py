@@ -17,9 +17,8 @@ from plant.truth import TRUTH_LENGTHS, TRUTH_POSITION, TRUTH_QUATERNION
 
 SINES = SimulationConfig(target="sines", duration=20.0, fusion="whole", lengths="incremental")
 
-
-WRONG = ("jumps:2,size_mm=2", "canopen"), ("frozen:2", "udp")
-"""Encoders' faults, and links, beside those in the plant itself; the others take as long."""
+ALSO_SLOW = ("jumps:2,size_mm=2", "canopen"), ("frozen:2", "udp")
+"""Faults and links that are slow tests beside those of the plant itself; the others are endurance tests."""
 
 
 def errors_of(records):
@@ -66,7 +65,9 @@ def test_at_power_on_the_pose_is_known_without_homing(seed):
 @pytest.mark.parametrize(
     ("fault", "link"),
     [
-        pytest.param(fault, link, marks=pytest.mark.slow if (fault, link) in WRONG or link == "fmu" else pytest.mark.endurance)
+        pytest.param(
+            fault, link, marks=pytest.mark.slow if (fault, link) in ALSO_SLOW or link == "fmu" else pytest.mark.endurance
+        )
         for link in ("fmu", "udp", "canopen")
         for fault in ("jumps:2,size_mm=2", "reversed:2", "slips:2,size_percent=20", "frozen:2")
     ],

@@ -145,7 +145,7 @@ def following_error(mechanism, target, references):
 
 
 def test_a_streamed_motion_is_followed_and_ends_at_rest_when_the_stream_does(hexapod):
-    # A busy machine may hold up each of the three processes; a fault of the code would show in every try.
+    # A busy machine may hold up each of the three processes; a lasting fault of the code would show in every try.
     for _ in range(4):
         target, _, references, causes, stream = streamed(hexapod, duration=2.5, watched=3.5)
         check(references, hexapod.limits)
