@@ -125,6 +125,8 @@ def test_the_end_of_a_run_waits_for_no_other_order(hexapod):
         Browser("127.0.0.1", port) as browser,
     ):  # fmt: skip
         take_control(browser)
+        # Its buttons are there before it is the one that is shown.
+        waited(lambda: page._live is not None)
         page._live._orders.give(server.get_clients()[0], lambda operator: over.wait(30.0))
         browser.press("Software quick stop")
         waited(lambda: run.link[Link.STOP] == StopRequest.QUICK, 5.0)
