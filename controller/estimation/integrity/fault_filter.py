@@ -9,7 +9,7 @@ information form: Y x = y for x = (m, f), which begins with nothing known. Of a 
     update   Y <- Y + H^T R^-1 H, y <- y + H^T R^-1 z       z: mean reading less what the loop's pose predicts; H = (J, 1)
 
 so that Y and y hold what the last half second says about f, and how much the pose depends on that. A window that a missed
-period interrupts is dropped: Y and y are carried over it. The drives held their rates in it, and then catch up. So rates and
+period interrupts is dropped: Y and y are carried over it. In a gap drives hold their rates, and then catch up. So rates and
 accelerations may have jumped, by as much as feedback has changed, and for some windows nothing is known of the jerk. No other
 part of the loop uses this filter's estimate, so that no fault of its own can bend the pose. The work of a window is spread over
 the cycles of the next one.
@@ -62,7 +62,7 @@ _BRIDGED_WINDOWS = 3
 """How much time between two windows may be lost by missed periods [windows]: a longer gap ends in a new beginning."""
 
 _CATCHING_UP = 5
-"""Windows from a missed period on in which drives may catch up: no plan has that jerk."""
+"""For so many windows, less one, after a missed period the drives may catch up: no plan has that jerk."""
 
 _JUMPS = 5.0, 30.0
 """How far the platform's velocity and rate may jump over missed periods, as a multiple of the greatest change of a leg's
@@ -111,7 +111,7 @@ STATE = record_dtype(
     feedback=(np.float64, LEGS),  # what feedback adds to the planned rate of each leg, sum [m/s]
     feedback_before=(np.float64, LEGS),  # its mean in the last full window [m/s]
     samples=(np.int64, IMU_COUNT),
-    jumped=np.float64,  # greatest change of it since the window before [m/s]
+    jumped=np.float64,  # greatest change of a leg's mean feedback since the window before [m/s]
     acceleration=(np.float64, LEGS),  # of the legs at the end of the last window
     next_path=PATH,  # in the middle of the present window
     arms=(np.float64, (LEGS, 3)),  # of the legs then, as their directions and lengths
