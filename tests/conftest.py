@@ -1,7 +1,9 @@
 """Fixtures that all rooms share."""
 
 import gc
+import os
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -40,6 +42,14 @@ def pytest_collection_finish() -> None:
     """What stays to the end, thousands of tests among it, need not be looked through at each collection of garbage."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(autouse=True)
+def _leaves_the_machine_to_others() -> Iterator[None]:
+    """A test that kept a real-time priority or a processor would hold up all tests after it, on the other workers too."""
+    allowed = os.sched_getaffinity(0)
+    yield
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER and os.sched_getaffinity(0) == allowed
 
 
 SHARED_DATA = Path(__file__).resolve().parent.parent.parent / "shared" / "data"

@@ -123,10 +123,15 @@ def processor_left(cpu: int | None) -> Iterator[None]:
                 os.sched_setaffinity(thread, allowed)
 
 
-def come_before_others() -> None:
-    """Let this process, which plans for a loop, come before all that is not real-time, as far as the machine allows it."""
-    with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY_RANGE[0]))
+@contextmanager
+def before_others() -> Iterator[None]:
+    """Let the calling thread, which plans for a loop, come before all that is not real-time while the context lasts, as far as
+    the machine allows it.
+    """
+    with ExitStack() as restore:
+        with suppress(OSError):
+            restore.callback(_take_priority(PRIORITY_RANGE[0]))
+        yield
 
 
 def _lock_memory() -> Callable[[], Any]:

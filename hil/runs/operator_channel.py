@@ -14,7 +14,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +28,7 @@ from controller.planning.motions.waves import checked_number
 from controller.planning.points import HOME
 from controller.safety.causes import Cause
 from hil.loop.records import Link, StopRequest
-from hil.realtime.scheduling import come_before_others
+from hil.realtime.scheduling import before_others
 from hil.recording.mcap import take
 from hil.runs.channel_process import MOST_CLIENTS
 from hil.runs.operated_platform import DEADMAN_S, SPEED, TURN_SPEED, OperatedPlatform, RefusedError, Workplace
@@ -102,11 +102,10 @@ def serve_channel(
         stream: dtype `STREAM`, shared with the loop, where an operator moves the platform.
         processor: that the loop keeps; None if it keeps none.
     """
-    platform = None
-    if stream is not None:
-        platform = OperatedPlatform(stream, workplace, period)
-        come_before_others()
-    asyncio.run(_Channel(platform, workplace, target, token, period, records, link, processor).run(listener))
+    platform = None if stream is None else OperatedPlatform(stream, workplace, period)
+    channel = _Channel(platform, workplace, target, token, period, records, link, processor)
+    with nullcontext() if platform is None else before_others():
+        asyncio.run(channel.run(listener))
 
 
 @dataclass(eq=False)

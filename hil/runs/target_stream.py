@@ -40,7 +40,7 @@ from controller.planning.plan_handover import (
 from controller.planning.stream_planner import Plan, StreamPlanner, TargetRefusedError
 from controller.planning.target import Target, samples_of
 from controller.safety.causes import Cause
-from hil.realtime.scheduling import come_before_others
+from hil.realtime.scheduling import before_others
 from hil.rigs.udp import datagrams
 from hil.rigs.udp.link import bound_socket
 from plant.compiled import Record
@@ -121,20 +121,20 @@ def receive(stream: Record, planner: StreamPlanner, receiver: socket.socket, per
     """
     parent = os.getppid()
     load_handover()
-    come_before_others()
     reception = Reception(stream, planner, period)
-    while not (stream["shared"][END_PLANNER] or os.getppid() != parent):
-        select.select([receiver], [], [], _SETTLE_S if reception.waits else _POLL_S)
-        for _ in range(_BATCH):
-            try:
-                datagram, sender = receiver.recvfrom(TARGET_DATAGRAM.itemsize + 1)
-            except BlockingIOError:
-                break
-            except OSError:
-                # An error of an earlier datagram does not concern the stream.
-                continue
-            reception.take(datagram, sender)
-        reception.plan()
+    with before_others():
+        while not (stream["shared"][END_PLANNER] or os.getppid() != parent):
+            select.select([receiver], [], [], _SETTLE_S if reception.waits else _POLL_S)
+            for _ in range(_BATCH):
+                try:
+                    datagram, sender = receiver.recvfrom(TARGET_DATAGRAM.itemsize + 1)
+                except BlockingIOError:
+                    break
+                except OSError:
+                    # An error of an earlier datagram does not concern the stream.
+                    continue
+                reception.take(datagram, sender)
+            reception.plan()
 
 
 def load_handover() -> None:

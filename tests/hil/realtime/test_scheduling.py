@@ -4,6 +4,7 @@ import gc
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -15,6 +16,7 @@ from hil.realtime.scheduling import (
     MEASURES,
     RealTimeSettings,
     Usage,
+    before_others,
     keep_to_one_thread,
     processor_left,
     processor_time,
@@ -63,6 +65,17 @@ def test_a_processor_is_left_to_the_loop_by_all_threads_and_what_they_start_and_
     finally:
         over.set()
         thread.join()
+
+
+def test_a_planner_comes_before_others_only_for_a_while():
+    """Its children do not."""
+    program = "import os; print(os.sched_getscheduler(0))"
+    with before_others():
+        first = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+        child = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=True)
+    # A machine may refuse it.
+    assert first == (os.SCHED_FIFO if os.geteuid() == 0 else first)
+    assert int(child.stdout) == os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 def test_nothing_is_collected_on_the_clock_and_again_afterwards():
