@@ -61,13 +61,19 @@ _TIMING_S = 3e-4
 _BRIDGED_WINDOWS = 3
 """How much time between two windows may be lost by missed periods [windows]: a longer gap ends in a new beginning."""
 
-_CATCHING_UP = 5
-"""For so many windows, less one, after a missed period the drives may catch up: no plan has that jerk."""
+_CATCHING_UP = 4
+"""For so many windows after a missed period the drives may catch up: no plan has that jerk."""
+
+_CATCHING_UP_STIFFNESS = 1e-6
+"""How well the jerk is known then, as a share of what is known otherwise."""
 
 _JUMPS = 5.0, 30.0
 """How far the platform's velocity and rate may jump over missed periods, as a multiple of the greatest change of a leg's
 feedback [-, rad/m]: drives hold their rates, and then catch up by a step.
 """
+
+_LEAST_JUMP = 1e-9
+"""A smaller change of feedback is rounding [m/s]."""
 
 _JERKS, _NEXT = 6, 3
 _FAULT_STIFFNESS = 1e-4
@@ -102,7 +108,8 @@ STATE = record_dtype(
     step=np.int64,  # cycles since that window was full
     collected=np.int64,  # cycles in the present window
     lost=np.int64,  # cycles since the last full window that are in no window
-    unsettled=np.int64,  # windows in which drives still catch up with missed periods
+    unsettled=np.int64,  # windows to come in which drives still catch up with missed periods
+    catching_up=np.int64,  # whether they did in the last full window
     between=np.float64,  # time between the middles of the last two full windows [s]
     follows=np.int64,  # whether the last full window directly follows the one before
     sum=(np.float64, (IMU_COUNT, READINGS)),  # of their samples
@@ -295,6 +302,7 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
     s.follows = s.windows > 0 and s.lost == 0
     s.between = p.duration * (1.0 + s.lost / p.window if s.windows > 0 else 1.0)
     s.lost = 0
+    s.catching_up = s.unsettled > 0
     s.unsettled = max(s.unsettled - 1, 0)
     if s.windows > 0:
         _find_shift(s.between, s.path, s.next_path, s.turn, s.shift)
@@ -392,10 +400,9 @@ def _forget(p: Record, s: Record, information: Array, vector: Array) -> None:
     for n in range(_JERKS):
         for m in range(_JERKS):
             s.factor[n, m] = by_place * z[n, m] + by_speed * z[n, 6 + m] + t * z[n, 12 + m]
-        # While drives catch up with missed periods no plan has that jerk.
-        s.factor[n, n] += p.stiffness[n // 3] if s.unsettled == 0 else 0.0
+        s.factor[n, n] += p.stiffness[n // 3] * (_CATCHING_UP_STIFFNESS if s.catching_up != 0 else 1.0)
     _take_away(s, information, vector, p.keep ** (t / p.duration))
-    if s.follows == 0 and s.jumped > 0.0:
+    if s.follows == 0 and s.jumped > _LEAST_JUMP:
         for first, per in ((6, 1.0), (12, p.duration)):
             _take_rows(s, first, information, vector)
             for n in range(_JERKS):

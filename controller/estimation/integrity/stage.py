@@ -77,6 +77,7 @@ LIMITS: Limits = {
     "filter.step": (0, MOST),
     "filter.collected": (0, MOST),
     "filter.lost": (0, MOST),
+    "filter.unsettled": (0, MOST),
     "evidence.waits": (0, evidence.LATE),
     "evidence.windows": (0, MOST),
     "evidence.order": (0, IMU_COUNT - 1),

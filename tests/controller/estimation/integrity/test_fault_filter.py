@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from controller.estimation.integrity.fault_filter import FAULTS, MEMORY_S, UNKNOWNS
+from controller.estimation.integrity.fault_filter import (
+    _CATCHING_UP,
+    _CATCHING_UP_STIFFNESS,
+    _JUMPS,
+    FAULTS,
+    MEMORY_S,
+    UNKNOWNS,
+    _forget,
+    bridge_gap,
+)
 from controller.estimation.whole_mechanism.readings import MOTION_STATES
 from tests.controller.estimation.integrity.made_up import RATE_HZ, constants, filtered, readings
 
@@ -85,6 +94,53 @@ def test_it_forgets():
     np.testing.assert_allclose(weights[:, 1], expected[1], rtol=0.1)
     # Of angular velocity, the unknown jerk takes a part away.
     assert (weights[:, 0] < 1.001 * expected[0]).all()
+
+
+@pytest.mark.parametrize("jumped", [0.0, 1e-12, 2e-4, 0.01])
+@pytest.mark.parametrize("catching_up", [False, True])
+@pytest.mark.parametrize("follows", [False, True])
+def test_what_jerk_and_jumps_take_away_is_what_they_add_to_the_covariance(follows, catching_up, jumped):
+    """Y^-1 becomes (Y^-1 + G Q G^T) / keep, and after a gap the variances of jumps are added to it."""
+    mechanism, _ = readings("static", 0.1)
+    parameters, state = constants(mechanism)
+    p, f = parameters[()]["integrity"]["filter"], state[()]["integrity"]["filter"]
+    random = np.random.default_rng(7)
+    # Deviations of 1 mm, 1 mrad, 10 mm/s, and so on, which depend on each other.
+    deviations = np.r_[np.repeat([1e-3, 1e-2, 1.0], 6), np.full(FAULTS, 0.1)]
+    mixed = np.eye(UNKNOWNS) + 0.05 * random.normal(size=(UNKNOWNS, UNKNOWNS))
+    covariance = deviations[:, None] * (mixed @ mixed.T) * deviations
+    estimate = deviations * random.normal(size=UNKNOWNS)
+    f["information"] = np.linalg.inv(covariance)
+    f["vector"] = f["information"] @ estimate
+    f["between"], f["follows"], f["catching_up"], f["jumped"] = 0.02, follows, catching_up, jumped
+    _forget(p, f, f["information"], f["vector"])
+    t, eye = 0.02, np.eye(6)
+    by_jerk = np.vstack([t**3 / 6.0 * eye, 0.5 * t**2 * eye, t * eye, np.zeros((FAULTS, 6))])
+    stiffness = np.repeat(p["stiffness"], 3) * (_CATCHING_UP_STIFFNESS if catching_up else 1.0)
+    expected = (covariance + by_jerk / stiffness @ by_jerk.T) * np.exp(t / MEMORY_S)
+    if jumped > 1e-9 and not follows:
+        jumps = np.repeat(np.array(_JUMPS) * jumped, 3)
+        expected += np.diag(np.r_[np.zeros(6), jumps**2, (jumps / p["duration"]) ** 2, np.zeros(FAULTS)])
+    found, expected = (each / np.outer(deviations, deviations) for each in (np.linalg.inv(f["information"]), expected))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+    # What is believed stays as it was; how firmly does not.
+    believed = np.linalg.solve(f["information"], f["vector"])
+    np.testing.assert_allclose(believed / deviations, estimate / deviations, rtol=1e-5, atol=1e-5)
+
+
+def test_drives_catch_up_for_some_windows_after_a_gap_and_not_before():
+    """The window before a gap, whose work is not done yet when periods are missed, keeps what is known of its jerk."""
+    mechanism, r = readings("0.5", 1.0, 5)
+    parameters, state = constants(mechanism)
+    f, seen = state["integrity"]["filter"], []
+    filtered(mechanism, r, parameters, state, missed={303: 2}, then=lambda: seen.append(int(f["catching_up"])))
+    first = seen.index(1)
+    assert seen[first:] == [1] * _CATCHING_UP + [0] * (len(seen) - first - _CATCHING_UP)
+    # 60 windows were full before, and the work of the last one was under way.
+    assert first == 60
+    before = f["catching_up"].copy()
+    bridge_gap(parameters[()]["integrity"]["filter"], state[()]["integrity"]["filter"], 3)
+    assert f["catching_up"] == before == 0
 
 
 def gaps(lost, seed, apart=(60, 160)):
