@@ -264,7 +264,7 @@ def cycle_parameters(
         load=load_feed_forward.load_parameters(mechanism, command_delay, position_drives),
         pid=pid.pid_parameters(control, limits.velocity),
         safety=safety_stage.safety_parameters(
-            watched, drive_settings or DriveSettings(), mechanism, rate, to_arm, position_drives
+            watched, drive_settings or DriveSettings(), mechanism, rate, to_arm, position_drives, watch_evidence
         ),
     )
 

@@ -36,16 +36,17 @@ STATE = record_dtype(
 
 def safety_parameters(
     settings: SafetySettings, drive_settings: DriveSettings, mechanism: Mechanism, rate: float, arm: bool,
-    position: bool = False,
+    position: bool = False, judged: bool = False,
 ) -> Record:  # fmt: skip
     """The constants (dtype `PARAMETERS`) in cycles of this rate [Hz].
 
-    The drives are enabled only if `arm`, and close position loops if `position`.
+    The drives are enabled only if `arm`, and close position loops if `position`. If evidence judges the IMUs, `judged`, they
+    are enabled after it has done so once.
     """
     limits = mechanism.require_limits()
     return filled(
         PARAMETERS,
-        arming=arming.arming_parameters(settings, rate, arm),
+        arming=arming.arming_parameters(settings, rate, arm, judged),
         monitor=imu_monitor.monitor_parameters(settings, rate),
         watch=watch.watch_parameters(settings, rate, limits),
         drives=drives.drive_parameters(drive_settings, mechanism, position),
@@ -58,7 +59,7 @@ def watch_nothing(parameters: Record) -> None:
     """Let the cycle with these parameters arm and go on whatever it finds, for motions that do not rely on the estimate."""
     parameters["imus"]["noise"] = parameters["imus"]["shaking"]["limit"] = np.inf
     safety = parameters["safety"]
-    safety["monitor"]["active"], safety["arming"]["approach"] = 0, 0
+    safety["monitor"]["active"] = safety["arming"]["approach"] = safety["arming"]["judged"] = 0
     safety["arming"]["distance"] = safety["arming"]["drift"] = np.inf
     limits = safety["watch"]
     limits["most_lost_imus"], limits["conditioning"] = IMU_COUNT, 0.0

@@ -29,6 +29,7 @@ PARAMETERS = record_dtype(
     approach=np.int64,  # whether the reference begins at the estimated lengths
     window=np.int64,  # samples of a length that are averaged
     ready=np.int64,  # for how many cycles without an answer a dry run stays ready for arming
+    judged=np.int64,  # whether evidence judges the IMUs
 )
 """The constants of arming."""
 
@@ -52,7 +53,7 @@ STATE = record_dtype(
 """How arming goes."""
 
 
-def arming_parameters(settings: SafetySettings, rate: float, active: bool) -> Record:
+def arming_parameters(settings: SafetySettings, rate: float, active: bool, judged: bool = False) -> Record:
     """The constants of arming (dtype `PARAMETERS`) in cycles of this rate [Hz]."""
     cycles = int(np.ceil(settings.arming_time * rate))
     return filled(
@@ -64,6 +65,7 @@ def arming_parameters(settings: SafetySettings, rate: float, active: bool) -> Re
         approach=1,
         window=max(1, round(_STILL_S * rate)),
         ready=0 if active else round(_READY_S * rate),
+        judged=judged,
     )
 
 
@@ -91,8 +93,8 @@ def run_arming_checks(
 ) -> None:  # fmt: skip
     """Before the commands: from idle to armed, and from armed to running.
 
-    Idle becomes armed when the IMUs are plausible, the estimate stands still, the pose is in the workspace and where the target
-    begins, and the drives are there. Armed becomes running when all drives follow. The reference then begins where the legs
+    Idle becomes armed when the IMUs have been judged and are plausible, the estimate stands still, the pose is in the workspace
+    and where the target begins, and the drives are there. Armed becomes running when all drives follow. The reference then begins where the legs
     are, and the motion when they have come to its start.
     """
     a = s.arming
@@ -241,4 +243,7 @@ def _find_obstacle(
             return Cause.NO_AGREEMENT.value, k, abs(error[k]), p.arming.distance
         if s.watch.drive[k] != DriveState.READY and s.watch.drive[k] != DriveState.FOLLOWING:
             return Cause.NO_DRIVES.value, k, np.nan, np.nan
+    # Without a first evaluation there is no protection level.
+    if s.mode == Mode.IDLE and p.arming.judged != 0 and integrity.evaluations == 0:
+        return Cause.NOT_JUDGED.value, -1, np.nan, np.nan
     return Cause.NONE.value, 0, np.nan, np.nan

@@ -221,6 +221,7 @@ class Cause(IntEnum):
     TOO_HEAVY = 78, "leg {} has too little force to hold the target", Reaction.STOP, "N"
     SINGULAR = 79, "the target is too near to a singularity", Reaction.STOP
     OPERATOR_LOST = 80, "the operator has gone while the platform was jogged", Reaction.STOP, "s"
+    NOT_JUDGED = 82, "not armed: nothing has judged the IMUs yet, as periods are missed too often", Reaction.STOP
     STAGE_FAILED = 81, "a stage in Python has failed", Reaction.QUICK_STOP
     NO_POSE_FITS = 66, "no pose fits the IMUs, even without the worst of them", Reaction.QUICK_STOP, "sigma RMS"
 

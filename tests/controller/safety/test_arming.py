@@ -51,6 +51,20 @@ def test_in_its_last_cycle_it_is_still_armed(hexapod):
     assert bench.state["safety"]["arming"]["delay"] == ARMING_CYCLES
 
 
+def test_arming_waits_until_the_imus_have_been_judged(hexapod):
+    """Periods are missed so often that hardly any window is full: without an evaluation there is no protection level."""
+    bench = Bench(hexapod)
+    for _ in range(bench.hold + 20):
+        skip_periods(bench.state, 1)
+        bench.step()
+    assert bench.mode == Mode.IDLE and bench.state["integrity"]["evaluations"] == 0
+    assert obstacle(bench)[:2] == (Cause.NOT_JUDGED, -1)
+    skip_periods(bench.state, 0)
+    while bench.mode == Mode.IDLE:
+        bench.step()
+    assert (bench.mode, bench.state["integrity"]["evaluations"]) == (Mode.RUNNING, 1)
+
+
 @pytest.mark.parametrize(
     ("lost", "need_platform", "armed"),
     [((2,), True, True), ((6,), True, False), ((6,), False, True), ((2, 5), True, False), ((0, 6), False, False)],
@@ -177,8 +191,11 @@ def test_a_pose_that_is_lost_before_arming_is_waited_for(hexapod):
     # The filters settle for 0.1 s, and the estimate stands still for another.
     bench.steps(99)
     assert (bench.mode, obstacle(bench)[0]) == (Mode.IDLE, Cause.NOT_STILL)
+    # Then the IMUs are judged.
     bench.steps(20)
-    assert bench.mode == Mode.RUNNING
+    assert (bench.mode, obstacle(bench)[0]) == (Mode.IDLE, Cause.NOT_JUDGED)
+    bench.steps(60)
+    assert bench.mode == Mode.RUNNING and bench.state["integrity"]["evaluations"] > 0
 
 
 def test_a_pose_that_stays_lost_is_a_fault_when_the_time_is_over(hexapod):
