@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from hil.faults.rows import Drawn
+from hil.faults.rows import MOST_LATE, Drawn
 from hil.loop.records import RECORD, Link
 from hil.realtime.clock import SCRIPTED, new_clock
 from hil.rigs.emulation import fault, new_emulated
@@ -34,6 +34,10 @@ def run(drawn: Drawn) -> tuple[Record, int, int]:
         hold = int(loop.parameters["rig"]["hold_cycles"])
         end = hold + round(config.duration * config.rate)
         faults = [fault(text) for text in drawn.faults] if drawn.link != "fmu" else []
+        if drawn.late_percent > 0.0:
+            # Late cycles that follow each other are not to end the run.
+            loop.most_missed = len(records)
+            _follow_script(loop, drawn.late_percent, config.seed)
         if drawn.link == "canopen":
             cause = _follow_canopen(loop, faults, config.seed, end)
         else:
@@ -89,14 +93,22 @@ def _follow_canopen(loop: PreparedLoop, faults: Iterable[Record], seed: int, end
 
 def _on_a_bus(loop: PreparedLoop) -> float:
     """Let commands take effect a period later, as on a bus; returns the period [s]."""
-    period = float(loop.parameters["rig"]["period"])
-    loop.parameters["load"]["command_delay"] = period
-    loop.clock = new_clock(SCRIPTED, round(1e9 * period))
+    loop.parameters["load"]["command_delay"] = loop.parameters["rig"]["period"]
+    if loop.clock["mode"] != SCRIPTED:
+        _follow_script(loop)
+    return float(loop.parameters["rig"]["period"])
+
+
+def _follow_script(loop: PreparedLoop, late_percent: float = 0.0, seed: int = 0) -> None:
+    """Let the loop's clock follow a script, in which a share of the cycles begins late."""
+    period_ns, random = round(1e9 * float(loop.parameters["rig"]["period"])), np.random.default_rng([seed, 2])
+    loop.clock = new_clock(SCRIPTED, period_ns)
     loop.script = np.zeros((1 << 14, 3), np.int64)
-    return period
+    late = random.random(len(loop.script)) < 0.01 * late_percent
+    loop.script[late, 0] = period_ns * random.integers(1, MOST_LATE + 1, np.count_nonzero(late))
 
 
 def _first_enabled(records: Record) -> int:
-    """The cycle in which the drives are first enabled, or the last one."""
-    enabled = np.flatnonzero(records["request"])
-    return int(enabled[0]) if len(enabled) else len(records)
+    """The cycle in which the drives are first enabled, or the one after the last."""
+    enabled = records["cycle"][records["request"] != 0]
+    return int(enabled[0] if len(enabled) else records["cycle"][-1] + 1)

@@ -357,7 +357,7 @@ def _judge(outcome: Outcome, seed: int, loop: PreparedLoop, cause: int, onset: i
     find(off > case.peak, f"a leg was {1e3 * off:.2f} mm off, and {1e3 * case.peak:g} are allowed")
     first = int(np.searchsorted(records["cycle"], onset))
     answered = len(records) if case.followed else first + int((records["silent"][first:] > 0).argmax()) + 1
-    figures = judge(records[:answered], first, frozenset(), cause, RATE_HZ)
+    figures = judge(records[:answered], onset, frozenset(), cause, RATE_HZ)
     position, rotation = (float(figures[f"{part}_before"] or 0.0) for part in ("position", "rotation"))
     outcome.position_m.append(position)
     outcome.rotation_rad.append(rotation)

@@ -31,6 +31,9 @@ SOUND = "sound"
 ENCODERS = "encoders"
 """The kind of rows with encoders."""
 
+MOST_LATE = 5
+"""A cycle that begins late does so by so many periods at most."""
+
 MOST_GUILTY = 3
 """So many IMUs with the same disturbance are each at fault; what more of them share is not mended by leaving one out."""
 
@@ -49,6 +52,7 @@ class Row:
         joint_off_mm: how far base joint {k} is off, in a random direction [mm].
         link: one of `LINKS`.
         lengths, base_imu: the added sensors, as in `SimulationConfig`.
+        late_percent: share of the cycles that begin one to `MOST_LATE` periods late, as on a busy machine [%].
         guilty: the IMUs that may rightly be left out; None for those that have a disturbance alone, or with a few others.
     """
 
@@ -69,6 +73,7 @@ class Row:
     link: str = "fmu"
     lengths: str = NO_LENGTHS
     base_imu: bool = False
+    late_percent: float = 0.0
     guilty: tuple[int, ...] | None = None
 
     def drawn(self, seed: int, fusion: str) -> "Drawn":
@@ -90,7 +95,7 @@ class Row:
         )  # fmt: skip
         guilty = guilty_of(faults) if self.guilty is None else frozenset(self.guilty)
         late = any(f"={at:g}" in text for text in faults) or any(each.at is not None for each in settings)
-        return Drawn(config, self.link, faults, guilty, at if late else 0.0)
+        return Drawn(config, self.link, faults, guilty, at if late else 0.0, self.late_percent)
 
     def _base_joints(self, k: int, random: np.random.Generator) -> Setting:
         """The true places of the base joints, of which the controller does not know."""
@@ -112,6 +117,7 @@ class Drawn:
         faults: texts.
         guilty: the IMUs that may rightly be left out.
         begin: when the disturbance begins, after the hold or, behind a bus, after the drives were enabled [s].
+        late_percent: as in `Row`.
     """
 
     config: SimulationConfig
@@ -119,6 +125,7 @@ class Drawn:
     faults: tuple[str, ...]
     guilty: frozenset[int]
     begin: float
+    late_percent: float = 0.0
 
 
 def guilty_of(faults: tuple[str, ...]) -> frozenset[int]:
@@ -175,6 +182,8 @@ def _rows(kind: str, entry: Mapping[str, Any]) -> Iterator[Row]:
         row = replace(row, name=row.name.format_map(known))
         if row.link not in LINKS:
             raise InputError(f"the row {row.name!r} has link = {row.link!r}; there are {', '.join(LINKS)}")
+        if not 0.0 <= row.late_percent <= 100.0:
+            raise InputError(f"the row {row.name!r} has late_percent = {row.late_percent:g}; it must be 0 to 100")
         if not 0.0 <= row.earliest <= row.latest < row.duration:
             raise InputError(
                 f"the row {row.name!r} has earliest = {row.earliest:g} and latest = {row.latest:g}; its disturbance must begin "

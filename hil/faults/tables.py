@@ -186,15 +186,17 @@ def list_table(items: Iterable[Case | Row]) -> Table:
     table = Table("kind", "name", "link", "Hz", "s", "faults and settings", left=(0, 1, 2, 5))
     for item in items:
         if isinstance(item, Row):
-            what = (*item.faults, *item.settings) or _built(item)
+            what = (*item.faults, *item.settings, *_others(item))
             table.add(item.kind, item.name, item.link, f"{item.rate:g}", f"{item.duration:g}", " ".join(what))
         else:
             table.add("reactions", item.name, "udp", f"{RATE_HZ:g}", "4.5", item.faults or item.streamed)
     return table
 
 
-def _built(row: Row) -> tuple[str, ...]:
+def _others(row: Row) -> tuple[str, ...]:
+    """What else is not as the controller has it."""
     sizes = {"base_bend_mm": row.base_bend_mm, "joint_off_mm": row.joint_off_mm, "joint_error_mm": 1e3 * row.joint_error}
+    sizes["late_percent"] = row.late_percent
     return tuple(f"{name}={size:g}" for name, size in sizes.items() if size)
 
 

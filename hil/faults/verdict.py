@@ -59,17 +59,18 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
     steering = np.isin(records["mode"], (Mode.RUNNING, Mode.STOPPING))
     truth = _truth(records)
     position, rotation = _errors(records, truth)
-    cycles = np.arange(len(records))
+    cycles = records["cycle"]
     events = _events(records, begin)
     first = events[0] if events else None
-    told_at = first[0] if first else len(records)
+    end = int(cycles[-1]) + 1 if len(records) else 0
+    told_at = first[0] if first else end
     encoder_off = _encoder_off(records, truth, begin, told_at)
     before, after = steering & (cycles >= begin) & (cycles <= told_at), steering & (cycles > told_at)
     used = (records["imus"][:, None] >> np.arange(IMU_COUNT)) & 1 != 0
     lost = ~used & (steering & (cycles >= begin))[:, None]
     left_out = np.flatnonzero(lost.any(axis=0))
     sound = [imu for imu in left_out.tolist() if imu not in guilty]
-    then = steering & (cycles >= (lost[:, sound].any(axis=1).argmax() if sound else len(records)))
+    then = steering & (cycles >= (cycles[lost[:, sound].any(axis=1).argmax()] if sound else end))
     position_then, rotation_then = _most(position, then), _most(rotation, then)
     references = records["reference"][:, :, 0]
     return {
@@ -83,7 +84,7 @@ def judge(records: Record, begin: int, guilty: frozenset[int], cause: int, rate:
         "alarms": _count_alarms(records, steering & (cycles < begin)),
         "events": json.dumps([[(at - begin) / rate, Cause(which).short, index] for at, which, index in events[:_MOST_EVENTS]]),
         "ended": Cause(cause).short,
-        "ended_s": (len(records) - begin) / rate,
+        "ended_s": (end - begin) / rate,
         "left_out": _listed(left_out.tolist()),
         "sound_left_out": _listed(sound),
         "forbidden": bool(
@@ -154,9 +155,8 @@ def _fresh(records: Record) -> NDArray[np.bool_]:
 def _encoder_off(records: Record, truth: Array, begin: int, told_at: int) -> float | None:
     """How far any encoder's reading changed otherwise than its length, from a cycle before `begin` until one [m]."""
     off = records["length"] - truth[:, TRUTH_LENGTHS]
-    answered = records["silent"] == 0
-    first = max(begin - 1, 0)
-    until = off[first : told_at + 1][answered[first : told_at + 1]]
+    cycles = records["cycle"]
+    until = off[(records["silent"] == 0) & (cycles >= begin - 1) & (cycles <= told_at)]
     changes = np.abs(until - until[:1])
     return float(np.nanmax(changes)) if np.isfinite(changes).any() else None
 
@@ -166,9 +166,9 @@ def _events(records: Record, begin: int) -> list[tuple[int, int, int]]:
     causes = records["event_cause"]
     rows, slots = np.nonzero(~np.isin(causes, _SAY_NOTHING))
     return [
-        (int(row), int(causes[row, slot]), int(records["event_index"][row, slot]))
+        (int(records["cycle"][row]), int(causes[row, slot]), int(records["event_index"][row, slot]))
         for row, slot in zip(rows.tolist(), slots.tolist(), strict=True)
-        if row >= begin
+        if records["cycle"][row] >= begin
     ]
 
 

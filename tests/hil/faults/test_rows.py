@@ -38,7 +38,7 @@ def test_there_are_the_issues_rows_and_sixty_more_of_every_kind():
     kinds = {row.kind for row in ROWS.values()}
     assert kinds >= {
         "common-accelerometers", "common-gyroscopes", "single-sensors", "temperature-and-supply", "clocks", "vibration",
-        "loosening", "base", "mechanism", "loads", "drives", "other-rates", "buses",
+        "loosening", "base", "mechanism", "loads", "drives", "other-rates", "missed-periods", "buses",
     }  # fmt: skip
     assert {row.rate for row in ROWS.values()} >= {250.0, 500.0, 1000.0, 4000.0}
     assert {row.link for row in ROWS.values()} == {"fmu", "udp", "canopen"}
@@ -139,6 +139,8 @@ def test_values_are_crossed_and_listed():
             {"name": "a", "earliest": -1},
             "'a' has earliest = -1 and latest = 5; its .* choose 0 <= earliest <= latest < duration = 20",
         ),
+        ({"name": "a", "late_percent": -1}, "'a' has late_percent = -1; it must be 0 to 100"),
+        ({"name": "a", "late_percent": "nan"}, "late_percent = nan"),
         ({"name": "a", "earliest": 6}, "earliest = 6 and latest = 5"),
         ({"name": "a", "latest": 9, "duration": 9}, "latest = 9; .* latest < duration = 9"),
         ({"name": "a {b}", "vary": {"b": [1], "latest": ["nan"]}}, "'a 1' has earliest = 2 and latest = nan"),

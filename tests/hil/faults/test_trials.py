@@ -12,7 +12,7 @@ from hil.engine.engine import InOneProcess
 from hil.faults import trials
 from hil.faults.links import run
 from hil.faults.reactions import CASES
-from hil.faults.rows import Row, all_rows
+from hil.faults.rows import MOST_LATE, Row, all_rows
 from hil.faults.trials import Trial, figures_of, outcomes_of, run_trials, trials_of
 from hil.sweep.store import Store
 from plant.errors import GoughError
@@ -34,6 +34,29 @@ def test_a_disturbance_begins_when_it_is_due_on_every_link_and_comes_out_the_sam
     again, *_ = run(drawn)
     for name in ("angular_velocity", "position", "truth", "event_cause", "sample_ns", "drive"):
         assert records[name].tobytes() == again[name].tobytes()
+
+
+@pytest.mark.parametrize("link", ["fmu", *(pytest.param(link, marks=pytest.mark.slow) for link in ("udp", "canopen"))])
+def test_a_share_of_the_cycles_is_late_on_every_link_and_the_same_ones_again(link):
+    row = replace(NOISY, link=link, late_percent=3.0, faults=())
+    records, _, cause = run(row.drawn(2, "compiled"))
+    assert cause == Cause.END_OF_MOTION
+    gaps = records["missed"][records["missed"] > 0]
+    # Of some 1,400 cycles; two late ones in a row make one gap.
+    assert 20 < len(gaps) < 65 and 1 <= gaps.min() < MOST_LATE <= gaps.max()
+    np.testing.assert_array_equal(run(row.drawn(2, "compiled"))[0]["missed"], records["missed"])
+    assert (run(row.drawn(3, "compiled"))[0]["missed"] > 0).tolist() != (records["missed"] > 0).tolist()
+
+
+@pytest.mark.parametrize(
+    ("fusion", "seed"), [("whole", 0), *(pytest.param(*each, marks=pytest.mark.slow) for each in (("compiled", 0), ("whole", 1)))]
+)
+def test_a_fault_is_told_on_a_machine_that_misses_periods(fusion, seed):
+    name = "a leg's IMU turns by 3 deg about x at once, 6 % of the cycles late"
+    (row,) = (row for row in all_rows() if row.name == name)
+    figures = figures_of(Trial(row, seed, fusion))
+    assert figures["told_s"] < 1.0 and not figures["forbidden"] and not figures["alarms"] and not figures["sound_left_out"]
+    assert figures["position_before"] < 5e-3 and figures["covered"] >= 0.999 * figures["cycles"]
 
 
 def test_bent_plates_and_loose_screws_are_in_the_plant():

@@ -26,6 +26,7 @@ RATE, CYCLES, BEGIN = 100.0, 400, 100
 def records(protection=np.nan):
     """Four seconds, of which the last half second is on the brakes; the error grows by 1 mm and 0.1 deg a second."""
     made = np.zeros(CYCLES, RECORD)
+    made["cycle"] = np.arange(CYCLES)
     times = np.arange(CYCLES) / RATE
     made["mode"] = Mode.RUNNING
     made["mode"][:20], made["mode"][350:] = Mode.IDLE, Mode.FAULT
@@ -56,6 +57,18 @@ def test_errors_are_told_apart_by_the_moment_at_which_something_is_told():
     assert json.loads(found["events"]) == [[1.5, "IMU is left out: it disagrees with the others", 3]]
     assert (found["ended"], found["ended_s"], found["alarms"]) == ("drive does not do what it is told", 3.0, 0)
     assert found["cycles"] == 330 and not found["forbidden"] and "covered" not in found
+
+
+def test_missed_periods_count_as_time():
+    """Every second period is missed from the hundredth on: the begin and all times are those of the clock."""
+    made = records()
+    tell(made, 250, Cause.IMU_DISAGREES, 3)
+    kept = np.r_[:100, 100:CYCLES:2]
+    missing = made[kept].copy()
+    missing["missed"] = np.diff(kept, prepend=-1) - 1
+    found = judge(missing, 150, frozenset({3}), Cause.DRIVE_DEVIATES, RATE)
+    assert (found["position_before"], found["position_after"]) == pytest.approx((2.5e-3, 3.48e-3))
+    assert (found["told_s"], found["ended_s"], found["cycles"]) == (1.0, 2.49, 80 + 125)
 
 
 def moving_exactly():
