@@ -94,8 +94,8 @@ def run_arming_checks(
     """Before the commands: from idle to armed, and from armed to running.
 
     Idle becomes armed when the IMUs have been judged and are plausible, the estimate stands still, the pose is in the workspace
-    and where the target begins, and the drives are there. Armed becomes running when all drives follow. The reference then begins where the legs
-    are, and the motion when they have come to its start.
+    and where the target begins, and the drives are there. Armed becomes running when all drives follow. The reference then
+    begins where the legs are, and the motion when they have come to its start.
     """
     a = s.arming
     if s.mode == Mode.IDLE:

@@ -49,7 +49,8 @@ def test_a_share_of_the_cycles_is_late_on_every_link_and_the_same_ones_again(lin
 
 
 @pytest.mark.parametrize(
-    ("fusion", "seed"), [("whole", 0), *(pytest.param(*each, marks=pytest.mark.slow) for each in (("compiled", 0), ("whole", 1)))]
+    ("fusion", "seed"),
+    [("whole", 0), *(pytest.param(*each, marks=pytest.mark.slow) for each in (("compiled", 0), ("whole", 1)))],
 )
 def test_a_fault_is_told_on_a_machine_that_misses_periods(fusion, seed):
     name = "a leg's IMU turns by 3 deg about x at once, 6 % of the cycles late"
