@@ -16,7 +16,7 @@ def cycle(parameters, state, measurement, segments):
 def follow_at_once(parameters):
     """Parameters with which the reference is the motion's after the hold, wherever the legs are, even if they never move."""
     arming = parameters["safety"]["arming"]
-    arming["drift"], arming["approach"] = np.inf, 0
+    arming["drift"], arming["approach"], arming["judged"] = np.inf, 0, 0
     parameters["safety"]["drives"]["slack"] = np.inf
     return parameters
 
