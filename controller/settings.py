@@ -157,7 +157,7 @@ class SafetySettings(_Settings):
     bus_patience: float = 0.02  # longest time without an answer of the rig [s]
     arming_distance: float = 0.01  # largest distance of a leg from the start of the target [m]
     arming_drift: float = 1e-3  # largest change of a leg's mean length on the brakes, from one 50 ms to the next [m]
-    arming_time: float = 1.0  # longest time for the checks before arming, and for the drives [s]
+    arming_time: float = 5.0  # longest time for the checks before arming, and for the drives [s]
     watch_imus: float = 1.0  # 0 to ignore the disagreement of an IMU
     need_platform_imu: float = 1.0  # 0 to go on while the platform's IMU is left out, which checks all legs at once
 

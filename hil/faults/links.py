@@ -18,7 +18,7 @@ from plant.extras import missing_extras_named
 from plant.imu_wiring import IMU_COUNT
 
 _SESSION = 1
-_REST_S = 5.0
+_REST_S = 9.0
 """Room in the records for a late arming and for the stop at the end [s]."""
 
 
@@ -109,6 +109,7 @@ def _follow_script(loop: PreparedLoop, late_percent: float = 0.0, seed: int = 0)
 
 
 def _first_enabled(records: Record) -> int:
-    """The cycle in which the drives are first enabled, or the one after the last."""
+    """The cycle in which the drives are first enabled, or the one after the last; 0 if there is none."""
     enabled = records["cycle"][records["request"] != 0]
-    return int(enabled[0] if len(enabled) else records["cycle"][-1] + 1)
+    after_last = records["cycle"][-1:] + 1
+    return int(np.append(enabled, np.append(after_last, 0))[0])

@@ -105,7 +105,7 @@ CASES = (
     Case("a leg's IMU is noisy", Cause.IMU_NOISY, GO_ON, 25, 2e-3, "imu-noisy:{k}"),
     Case("a leg's IMU is biased by 2 deg", Cause.IMU_CONTRADICTED, GO_ON, 600, 6e-3, "imu-biased:{k}"),
     Case(
-        "a leg's IMU is biased by 2 deg from the start", Cause.NO_SENSORS, STOP, 1300, 1e-3,
+        "a leg's IMU is biased by 2 deg from the start", Cause.NO_SENSORS, STOP, 5300, 1e-3,
         "imu-biased:{k}", from_start=True,
     ),
     Case(

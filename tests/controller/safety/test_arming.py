@@ -11,7 +11,7 @@ from controller.settings import SafetySettings
 from tests.controller.leg_geometry import static_signals
 from tests.controller.safety.test_safety import RATE_HZ, Bench
 
-ARMING_CYCLES = 500
+ARMING_CYCLES = 2500
 """1 s at 500 Hz."""
 
 
