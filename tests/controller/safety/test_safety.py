@@ -98,7 +98,7 @@ def test_a_bus_that_answers_now_and_then_is_lost(hexapod):
 
 @pytest.mark.parametrize("drive", [DriveState.NOT_READY, DriveState.FAULTY, DriveState.QUICK_STOPPING])
 def test_drives_that_are_not_ready_are_not_armed(bench, drive):
-    told = bench.steps(bench.hold + round(1.1 * RATE_HZ), drive=[DriveState.READY] * 3 + [drive] + [DriveState.READY] * 2)
+    told = bench.steps(bench.hold + round(5.1 * RATE_HZ), drive=[DriveState.READY] * 3 + [drive] + [DriveState.READY] * 2)
     assert bench.state["safety"]["stop"]["cause"] == Cause.NO_DRIVES
     assert told.count(Cause.NO_DRIVES) == 1
     assert bench.request == Request.BRAKED
@@ -108,7 +108,7 @@ def test_drives_that_are_not_ready_are_not_armed(bench, drive):
 
 def test_a_target_that_begins_elsewhere_is_not_armed(hexapod):
     bench = Bench(hexapod, off=0.012)
-    bench.steps(bench.hold + round(1.1 * RATE_HZ))
+    bench.steps(bench.hold + round(5.1 * RATE_HZ))
     assert bench.state["safety"]["stop"]["cause"] == Cause.NO_AGREEMENT
     assert "leg 0 is not where the target begins (0.012 m, the limit is 0.01 m)" in describe_end(bench.state)
 
