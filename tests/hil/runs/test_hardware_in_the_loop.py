@@ -280,41 +280,43 @@ def test_a_rig_that_is_not_there_or_stands_elsewhere_is_not_driven():
     ("options", "words"),
     [
         pytest.param((), "the target's stream has stopped", marks=pytest.mark.slow),
-        pytest.param(("--jump-at", 2), "the target", marks=pytest.mark.slow),
+        pytest.param(("--jump-at", 2), "the target jumps", marks=pytest.mark.slow),
         pytest.param(("--nan-at", 2), "the target is not finite", marks=pytest.mark.endurance),
     ],
 )
 def test_a_streamed_target_is_followed_until_it_goes_wrong(tmp_path, options, words):
+    """On a busy machine, the sender may wait for a processor longer than the run waits for it. Then there is another run."""
+    for attempt in range(4):
+        recording = tmp_path / f"{attempt}.mcap"
+        errors = follow_stream(recording, *options)
+        if words in errors or "the target's stream has stopped" not in errors:
+            break
+    assert words in errors
+    records = read(recording).records
+    assert np.ptp(records["truth"][:, :3], axis=0).max() > 2e-3
+    moved = records[records["mode"] == Mode.RUNNING]
+    assert np.abs(moved["truth"][:, TRUTH_LENGTHS] - moved["reference"][:, :, 0]).max() < 3e-3
+    assert replay([recording]).same
+
+
+def follow_stream(recording, *options):
+    """What a run says that follows a stream with these options until it fails; without any, the sender is killed in motion."""
     port = free_port()
     run = gough(
-        "run",
-        "--target",
-        f"stream:127.0.0.1:{port}",
-        "--rate",
-        500,
-        "--duration",
-        60,
-        *PATIENT,
-        "--record",
-        tmp_path / "x.mcap",
-    )
-    wait_for(lambda: run.poll() is not None or ((tmp_path / "x.mcap").exists() and moving(tmp_path / "x.mcap")))
+        "run", "--target", f"stream:127.0.0.1:{port}", "--rate", 500, "--duration", 60, *PATIENT, "--record", recording
+    )  # fmt: skip
+    wait_for(lambda: run.poll() is not None or (recording.exists() and moving(recording)))
     assert run.poll() is None, run.communicate()
     sender = gough("stream-target", "--target", "sines", "--duration", 60, "--to", f"127.0.0.1:{port}", *options)
     if not options:
-        wait_for(lambda: np.ptp(read(tmp_path / "x.mcap").records["truth"][:, :3], axis=0).max() > 5e-3)
+        wait_for(lambda: np.ptp(read(recording).records["truth"][:, :3], axis=0).max() > 5e-3)
         sender.kill()
     status, _, errors = finished(run)
     # It would go on to its end.
     sender.kill()
     finished(sender)
     assert status == 1
-    assert words in errors
-    records = read(tmp_path / "x.mcap").records
-    assert np.ptp(records["truth"][:, :3], axis=0).max() > 2e-3
-    moved = records[records["mode"] == Mode.RUNNING]
-    assert np.abs(moved["truth"][:, TRUTH_LENGTHS] - moved["reference"][:, :, 0]).max() < 3e-3
-    assert replay([tmp_path / "x.mcap"]).same
+    return errors
 
 
 def moving(path):
