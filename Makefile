@@ -11,11 +11,11 @@ comma := ,
 # Without Python's bytecode each of some hundred processes of the tests, and each worker at each collection, compiles all modules.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Installs with pip, says every ten seconds that it goes on, and notes what is there now.
+# Installs with pip, says every ten seconds that it goes on, and notes what is there now. With --jobs, one pip waits for another.
 define install
 @echo "Installing $(1) into .venv, once; all that a first run needs takes 1.1 GB and some minutes."
 @( for ((s = 10; ; s += 10)); do sleep 10 >/dev/null 2>&1 </dev/null; echo "  still installing: $$s s"; done ) & \
-	clock=$$!; trap "kill $$clock" EXIT; $(BIN)/pip install --quiet --constraint constraints.txt --editable '$(1)'
+	clock=$$!; trap "kill $$clock" EXIT; flock .venv $(BIN)/pip install --quiet --constraint constraints.txt --editable '$(1)'
 @touch $(2)
 endef
 

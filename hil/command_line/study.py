@@ -297,8 +297,9 @@ _EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
     cli.argument(
         "--only",
         metavar="TEXT",
-        action="append",
-        help="only cases with this text in their names or kinds, such as 'base' or vibration; can be given several times",
+        action="extend",
+        nargs="+",
+        help="only cases with one of these texts in their names or kinds, such as 'base' or vibration",
     ),
     cli.flag("--list", "print which cases there are, and run nothing"),
     cli.setting("--fusion", "compiled,whole", "ways to fuse the IMUs, as for 'gough simulate', with commas in between"),
