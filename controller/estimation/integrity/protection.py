@@ -8,11 +8,12 @@ chance alone gives.
 
     no fault       |C_mm^-1 c_m|
     unseen fault   sqrt(tr V / 4): what could be there unseen; little where the readings would show it
-    seen fault     sqrt((e + 1/4) tr V) + 8 |m| min(1, e / 7)
+    seen fault     sqrt((e + 1/4) tr V) + (2 |m| + 6 |m - u|) min(1, e / 12)
 
-The 8 is for faults that grow: such a fault is larger at the end of the filter's memory than on average over it, and has moved
-the pose before, and goes on until the next evaluation. A fault since the loop began has had little time to move the pose: these
-terms grow over the first four seconds.
+u is the usual m of the hypothesis, averaged over 5 s. The 6 is for faults that grow: such a fault is larger at the end of the
+filter's memory than on average over it, and has moved the pose before, and goes on until the next evaluation. What lasts has
+grown already: the gyroscopes of IMUs that get warm together show a small error all the time. A fault since the loop began has
+had little time to move the pose: these terms grow over the first four seconds.
 
 The level is the root of the sum of the squares of eight terms:
 
@@ -34,6 +35,7 @@ Terms 3 to 8 are renewed in every cycle; term 6 is that of the cycle before, and
 
 import numpy as np
 
+from controller.estimation.integrity.hypotheses import HYPOTHESES
 from controller.least_squares import factor_cholesky, solve_cholesky
 from plant.compiled import Record, kernel, record_dtype
 from plant.pose import Array
@@ -45,14 +47,19 @@ _CHANCE = 1.0
 _UNSEEN = 0.25
 """Evidence ascribed to a fault for which there is less [-]."""
 
-_SURELY = 7.0
+_SURELY = 12.0
 """Evidence beyond chance from which on a fault is taken to be there."""
 
 _BENDING_S = 4.0
 """How long a fault takes to move the pose [s]."""
 
-_GROWN = 8.0
-"""By which factor the present error may exceed the mean one within the fault filter's memory."""
+_LASTING, _GROWN = 2.0, 6.0
+"""By which factor the present error may exceed the mean one within the fault filter's memory, and by which more the part of it
+that is not usual.
+"""
+
+USUAL_S = 5.0
+"""Over what time the usual error is averaged [s]."""
 
 _OF_CLOSED_FORM, _OF_SOURCE = (0.5, 1.4), (2.5, 1.4)
 """How many standard deviations of position and rotation count: of the pose in closed form, and of the better known of this and
@@ -95,6 +102,7 @@ STATE = record_dtype(
     error=(np.float64, POSE),  # of the pose without a fault
     effect=(np.float64, (POSE, POSE)),  # of the directions of a hypothesis on the pose, a direction a row
     shift=(np.float64, POSE),  # of the pose by the fault
+    usual=(np.float64, (HYPOTHESES, POSE)),  # error of the pose that each hypothesis leaves, averaged
     covariance=(np.float64, (2, POSE, POSE)),  # of the pose in closed form, and as its source has it
     scratch=(np.float64, (POSE, POSE)),
 )
@@ -119,7 +127,7 @@ def begin_level(s: Record, e: Record) -> None:
 
 @kernel
 def take_hypothesis(
-    s: Record, e: Record, hypothesis: int, count: int, first: int, last: int, found: float, t: Record
+    s: Record, e: Record, hypothesis: int, count: int, first: int, last: int, found: float, new_share: float, t: Record
 ) -> None:  # fmt: skip
     """Take the effect of a hypothesis, for which `evidence_for` has just been called, if it is the greatest so far.
 
@@ -129,6 +137,7 @@ def take_hypothesis(
         count: of its directions.
         first, last: their span.
         found: the evidence.
+        new_share: of this evaluation in the usual error.
     """
     if s.determined == 0:
         return
@@ -153,12 +162,18 @@ def take_hypothesis(
             s.shift[i] += effect[i] * t.right[n]
     seen = max(found - count - _CHANCE, 0.0)
     for part in range(2):
-        squared = variance = 0.0
+        squared = grown = variance = 0.0
         for i in range(3 * part, 3 * part + 3):
-            squared += (s.error[i] - s.shift[i]) ** 2
+            left = s.error[i] - s.shift[i]
+            squared += left**2
+            grown += (left - s.usual[hypothesis, i]) ** 2
+            # What is no number would stay.
+            if np.isfinite(left):
+                s.usual[hypothesis, i] += new_share * (left - s.usual[hypothesis, i])
             for n in range(count):
                 variance += s.effect[n, i] ** 2
-        fault = np.sqrt((seen + _UNSEEN) * variance) + _GROWN * np.sqrt(squared) * min(1.0, seen / _SURELY)
+        most = _LASTING * np.sqrt(squared) + _GROWN * np.sqrt(grown)
+        fault = np.sqrt((seen + _UNSEEN) * variance) + most * min(1.0, seen / _SURELY)
         if fault > s.fault[part]:
             s.fault[part] = fault
             s.next_hypothesis[part] = hypothesis

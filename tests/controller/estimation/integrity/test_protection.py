@@ -22,14 +22,14 @@ def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT
     return level["level"].copy()
 
 
-def level_of(state, frames, predicted, place):
-    """The level by the formula of the module."""
+def level_of(state, frames, predicted, place, usual):
+    """The level by the formula of the module, and the error that each hypothesis leaves (HYPOTHESES, 6)."""
     e = state["integrity"]["evidence"]
     information = np.tril(e["pose_information"])
     information = information + np.tril(information, -1).T
     covariance = np.linalg.inv(information)
     error, effect = covariance @ e["pose_vector"], covariance @ e["pose_by_fault"]
-    faults, d = [[np.linalg.norm(error[:3]), np.linalg.norm(error[3:])]], np.zeros((6, 42))
+    faults, d, left = [[np.linalg.norm(error[:3]), np.linalg.norm(error[3:])]], np.zeros((6, 42)), []
     for h in range(HYPOTHESES):
         count = directions_of(h, frames, predicted, place, d)
         used = d[:count]
@@ -38,14 +38,18 @@ def level_of(state, frames, predicted, place):
         seen = max(right @ inverse @ right - count - 1.0, 0.0)
         spread = effect @ used.T @ inverse @ used @ effect.T
         m = error - effect @ used.T @ inverse @ right
+        left.append(m)
+        new = m - usual[h]
         faults.append(
             [
-                np.sqrt((seen + 0.25) * np.trace(spread[s, s])) + 8.0 * np.linalg.norm(m[s]) * min(1.0, seen / 7.0)
+                np.sqrt((seen + 0.25) * np.trace(spread[s, s]))
+                + (2.0 * np.linalg.norm(m[s]) + 6.0 * np.linalg.norm(new[s])) * min(1.0, seen / 12.0)
                 for s in (slice(0, 3), slice(3, 6))
             ]
         )
     closed, own = traces()
-    return np.sqrt([0.5**2, 1.4**2] * closed + [2.5**2, 1.4**2] * np.minimum(own, closed) + np.max(faults, axis=0) ** 2)
+    squared = [0.5**2, 1.4**2] * closed + [2.5**2, 1.4**2] * np.minimum(own, closed) + np.max(faults, axis=0) ** 2
+    return np.sqrt(squared), np.array(left)
 
 
 def traces(covariances=OWN):
@@ -59,13 +63,22 @@ def test_it_is_the_greatest_over_the_hypotheses(fault):
     s = state["integrity"]
     e, t, level = s["evidence"], s["hypotheses"], s["protection"]
     frames = np.tile(np.eye(3), (7, 1, 1))
+    share, usual = 0.25, np.zeros((HYPOTHESES, 6))
+    for _ in range(3):
+        begin_level(level[()], e[()])
+        for h in range(HYPOTHESES):
+            count = directions_of(h, frames, s["filter"]["predicted"], e["place"], t["directions"])
+            span = span_of(h, e["place"])
+            found = evidence_for(count, *span, e["weight"], e["vector"], t[()])
+            take_hypothesis(level[()], e[()], h, count, *span, found, share, t[()])
+        expected, left = level_of(state, frames, s["filter"]["predicted"], e["place"], usual)
+        np.testing.assert_allclose(ended(level), expected, rtol=2e-3)
+        usual += share * (left - usual)
+        np.testing.assert_allclose(level["usual"], usual, rtol=2e-3, atol=1e-6)
+    e["pose_vector"][0] = np.nan
     begin_level(level[()], e[()])
-    for h in range(HYPOTHESES):
-        count = directions_of(h, frames, s["filter"]["predicted"], e["place"], t["directions"])
-        span = span_of(h, e["place"])
-        take_hypothesis(level[()], e[()], h, count, *span, evidence_for(count, *span, e["weight"], e["vector"], t[()]), t[()])
-    expected = level_of(state, frames, s["filter"]["predicted"], e["place"])
-    np.testing.assert_allclose(ended(level), expected, rtol=2e-3)
+    take_hypothesis(level[()], e[()], 0, count, *span, found, share, t[()])
+    np.testing.assert_allclose(level["usual"], usual, rtol=2e-3, atol=1e-6)
 
 
 def test_where_the_pose_is_not_determined_there_is_no_level():
