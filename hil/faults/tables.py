@@ -26,7 +26,7 @@ _GREATEST = (
 
 
 def summary(
-    outcomes: list[Outcome], disturbances: list[dict[str, Any]], sound: list[dict[str, Any]], seeds: int
+    outcomes: list[Outcome], disturbances: list[dict[str, Any]], sound: list[dict[str, Any]], seeds: int, first_seed: int = 0
 ) -> dict[str, Any]:
     """Everything, for JSON, in SI units; what is not finite is null."""
     return {
@@ -34,6 +34,7 @@ def summary(
         "disturbances": _finite(disturbances),
         "sound": _finite(sound),
         "seeds": seeds,
+        "first_seed": first_seed,
         "rate_hz": RATE_HZ,
         "version": version("gough"),
     }

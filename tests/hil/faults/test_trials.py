@@ -108,6 +108,18 @@ def test_a_table_keeps_what_has_run(tmp_path, monkeypatch):
     assert shares[-1][0] == 1.0 and shares[-1][1].startswith("6 of 6 runs")
 
 
+def test_the_seeds_after_the_first_ones_are_the_same_trials(tmp_path):
+    row = Row("a", "b")
+    assert trials_of([row], 2, ("whole",), first=3) == trials_of([row], 5, ("whole",))[3:]
+    what = ("faults", "--only", "emergency stop", "--seeds", "1", "--workers", "1", "--json", str(tmp_path / "faults.json"))
+    summaries = []
+    for first in ("0", "1"):
+        assert main([*what, "--first-seed", first]) == 0
+        summaries.append(json.loads((tmp_path / "faults.json").read_text()))
+    assert [each["first_seed"] for each in summaries] == [0, 1] and summaries[0]["cases"] != summaries[1]["cases"]
+    assert main([*what, "--first-seed", "-1"]) == 2
+
+
 def test_a_trial_that_fails_is_named(tmp_path, monkeypatch):
     wrong = trials_of([Row("wrong", "b", ("imu-dead:{k}",), link="fmu")], 1, ("whole",))
     with pytest.raises(GoughError, match="there is no disturbance 'dead'"):
