@@ -426,7 +426,7 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         level = s.integrity.protection
         trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])
         trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance[1])
-        end_level(level, time.cycle * rig.period)
+        end_level(level, s.integrity.evidence, time.cycle * rig.period)
         if watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
             trust.restart_filter(s.mechanism, time)
             integrity.restart_integrity(p.integrity, s.integrity)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.safety.arming import longest_delay
 from controller.safety.causes import Cause, Reaction
 from hil.loop.driver import prevent_compilation
 from hil.loop.records import RECORD, Link, shared_array
@@ -149,7 +150,7 @@ class _Bench:
         self._settings, self._compare = settings, compare
         self._cyclictest = compare and shutil.which("cyclictest") is not None
         with prepared_loop(self._config) as loop:
-            self._records = shared_array(loop.end + round(rate), RECORD)
+            self._records = shared_array(loop.end + longest_delay(loop.parameters), RECORD)
         _run_bare(new_clock(0, 1), 0, 0, np.zeros((1, 2), np.int64))
 
     def add_slice(self, condition: str) -> None:

@@ -10,10 +10,10 @@ chance alone gives.
     unseen fault   sqrt(tr V / 4): what could be there unseen; little where the readings would show it
     seen fault     sqrt((e + 1/4) tr V) + (2 |m| + 6 |m - u|) min(1, e / 12)
 
-u is the usual m of the hypothesis, averaged over 5 s. The 6 is for faults that grow: such a fault is larger at the end of the
-filter's memory than on average over it, and has moved the pose before, and goes on until the next evaluation. What lasts has
-grown already: the gyroscopes of IMUs that get warm together show a small error all the time. A fault since the loop began has
-had little time to move the pose: these terms grow over the first four seconds.
+u is the usual m of the hypothesis, averaged over some 6 s. The 6 is for faults that grow: such a fault is larger at the end of
+the filter's memory than on average over it, and has moved the pose before, and goes on until the next evaluation. What lasts
+has grown already: the gyroscopes of IMUs that get warm together show a small error all the time. A fault since the loop began
+has had little time to move the pose: these terms grow over the first four seconds.
 
 The level is the root of the sum of the squares of eight terms:
 
@@ -54,12 +54,12 @@ _BENDING_S = 4.0
 """How long a fault takes to move the pose [s]."""
 
 _LASTING, _GROWN = 2.0, 6.0
-"""By which factor the present error may exceed the mean one within the fault filter's memory, and by which more the part of it
-that is not usual.
+"""How many times the mean error within the fault filter's memory counts, and how many times more the part of it that is not
+usual.
 """
 
 USUAL_S = 5.0
-"""Over what time the usual error is averaged [s]."""
+"""Over what time of evaluations the usual error is averaged [s]; each fifth evaluation is about what was learned instead."""
 
 _OF_CLOSED_FORM, _OF_SOURCE = (0.5, 1.4), (2.5, 1.4)
 """How many standard deviations of position and rotation count: of the pose in closed form, and of the better known of this and
@@ -95,7 +95,8 @@ STATE = record_dtype(
     closed=(np.float64, 2),  # square of the closed form's standard deviation then
     misfit=np.float64,  # of the closed form, averaged
     hypothesis=(np.int64, 2),  # that gives the level; -1: none
-    fault=(np.float64, 2),  # the greatest effect of a fault, of the evaluation under way
+    fault=(np.float64, 2),  # the greatest effect of a fault, of the last complete evaluation of recent readings
+    next_fault=(np.float64, 2),  # of the one under way
     next_hypothesis=(np.int64, 2),  # that has it; -1: none
     determined=np.int64,  # whether the readings determine the pose
     factor=(np.float64, (POSE, POSE)),  # Cholesky, of the pose's information
@@ -122,7 +123,7 @@ def begin_level(s: Record, e: Record) -> None:
         squared = 0.0
         for i in range(3 * part, 3 * part + 3):
             squared += s.error[i] ** 2
-        s.fault[part] = np.sqrt(squared)
+        s.next_fault[part] = np.sqrt(squared)
 
 
 @kernel
@@ -174,20 +175,24 @@ def take_hypothesis(
                 variance += s.effect[n, i] ** 2
         most = _LASTING * np.sqrt(squared) + _GROWN * np.sqrt(grown)
         fault = np.sqrt((seen + _UNSEEN) * variance) + most * min(1.0, seen / _SURELY)
-        if fault > s.fault[part]:
-            s.fault[part] = fault
+        if fault > s.next_fault[part]:
+            s.next_fault[part] = fault
             s.next_hypothesis[part] = hypothesis
 
 
 @kernel
-def end_level(s: Record, age: float) -> None:
+def end_level(s: Record, e: Record, age: float) -> None:
     """End an evaluation; the level is infinite where the readings do not determine the pose.
 
     Args:
         s: dtype `STATE`, with the covariances of the pose.
+        e: dtype `evidence.STATE`. If the evaluation is about what was learned, the faults are those of the one before.
         age: for how long the loop has run [s].
     """
     bent = min(1.0, age / _BENDING_S)
+    if e.of_learned == 0:
+        s.fault[:] = s.next_fault
+        s.hypothesis[:] = s.next_hypothesis
     for part in range(2):
         closed = own = 0.0
         for i in range(3 * part, 3 * part + 3):
@@ -199,7 +204,6 @@ def end_level(s: Record, age: float) -> None:
         squared += (bent * s.fault[part]) ** 2
         s.closed[part] = closed if np.isfinite(closed) else 0.0
         s.evaluated[part] = squared if s.determined != 0 else np.inf
-        s.hypothesis[part] = s.next_hypothesis[part]
 
 
 @kernel

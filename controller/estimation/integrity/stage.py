@@ -197,7 +197,9 @@ def _do(p: Record, s: Record, rig: Record, imus: Record, step: int) -> None:
         if imu_of(h) < 0:
             s.found[h] /= p.shared_noise
         if e.of_learned == 0:
-            protection.take_hypothesis(s.protection, e, h, count, first, last, s.found[h], p.new_share, t)
+            # The first readings after a new beginning tell little.
+            share = p.new_share if s.filter.windows * p.filter.duration > fault_filter.MEMORY_S else 0.0
+            protection.take_hypothesis(s.protection, e, h, count, first, last, s.found[h], share, t)
     else:
         at = step - _FIRST_TOTAL
         if at == 0:

@@ -12,7 +12,7 @@ from tests.controller.leg_geometry import static_signals
 from tests.controller.safety.test_safety import RATE_HZ, Bench
 
 ARMING_CYCLES = 2500
-"""1 s at 500 Hz."""
+"""5 s at 500 Hz."""
 
 
 def obstacle(bench):

@@ -174,7 +174,7 @@ def test_in_motion_a_leg_is_watched_in_both_directions(hexapod, leg, sign):
 def test_a_dry_run_says_what_is_in_the_way_and_asks_nothing_of_the_drives(hexapod):
     for off, words in ((0.0, ""), (0.012, "not armed: leg 0 is not where the target begins")):
         bench = Bench(hexapod, off=off, to_arm=False)
-        bench.steps(bench.hold + 1000)
+        bench.steps(bench.hold + round(6.0 * RATE_HZ))
         assert (bench.mode, bench.request) == (Mode.IDLE, Request.BRAKED)
         assert describe_obstacle(bench.state).startswith(words) and bool(describe_obstacle(bench.state)) == bool(words)
 

@@ -131,7 +131,7 @@ def test_a_trial_that_fails_is_named(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_after_a_kill_the_command_goes_on_and_the_table_is_the_same(tmp_path):
     """A real process is killed while it works; the next one runs what is missing, and no run twice."""
-    what = ("faults", "--only", "an axis of the platform's gyroscope is stuck", "--only", "emergency", "--seeds", "6")
+    what = ("faults", "--only", "an axis of the platform's gyroscope is stuck", "emergency", "--seeds", "6")
     command = ("hil.command_line", *what, "--fusion", "compiled", "--workers", "1", "--results", "kept")
     kept = tmp_path / "kept"
     with started(command, tmp_path) as killed:

@@ -312,7 +312,7 @@ def test_a_clock_on_the_machine_wakes_at_every_deadline():
     with prepared_loop(SimulationConfig(target="hold", duration=0.5, rate=250.0)) as loop:
         loop.clock = new_clock(REAL, 4 * MS)
         loop.most_missed = 1000
-        loop.records = np.zeros(1000, RECORD)
+        loop.records = np.zeros(2000, RECORD)
         assert loop.follow(175) == Cause.END_OF_MOTION
         records = written(loop)
         assert (np.diff(records["cycle"]) == 1 + records["missed"][1:]).all()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from controller.estimation.integrity.evidence import STATE
 from controller.estimation.integrity.hypotheses import HYPOTHESES, directions_of, evidence_for, span_of
 from controller.estimation.integrity.protection import begin_level, end_level, publish_level, take_hypothesis
 from tests.controller.estimation.integrity.made_up import constants
@@ -14,10 +15,14 @@ OWN = np.array([np.diag([4e-8, 1e-8, 9e-8, 1e-6, 4e-6, 1e-6]), np.diag([1e-8, 2e
 NOT = (0.0, 0.0)
 
 
-def ended(level, age=50.0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, apart=NOT, drifted=NOT):
+def ended(
+    level, age=50.0, of_learned=0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, apart=NOT, drifted=NOT
+):
     """The level (2,) at the end of an evaluation, with a misfit that lasts."""
     level["covariance"], level["misfit"] = own, misfit
-    end_level(level[()], age)
+    evidence = np.zeros((), STATE)
+    evidence["of_learned"] = of_learned
+    end_level(level[()], evidence[()], age)
     publish_level(level[()], misfit, 0.01, steady, shaken, *(np.array(each) for each in (bent, moved, apart, drifted)))
     return level["level"].copy()
 
@@ -94,10 +99,22 @@ def test_a_fault_has_had_as_much_time_as_the_loop_to_move_the_pose():
     level = state["integrity"]["protection"]
     level["determined"] = 1
     for age, share in ((0.0, 0.0), (1.0, 0.25), (4.0, 1.0), (100.0, 1.0)):
-        level["fault"] = 0.0
+        level["next_fault"] = 0.0
         without = ended(level, age)
-        level["fault"] = fault = np.array([0.01, 0.1])
+        level["next_fault"] = fault = np.array([0.01, 0.1])
         np.testing.assert_allclose(ended(level, age), np.hypot(without, share * fault))
+
+
+def test_an_evaluation_that_was_not_ended_takes_nothing_away():
+    """Its greatest fault so far is not that of all hypotheses; what follows may be an evaluation of what was learned."""
+    _, state = evaluated()
+    level = state["integrity"]["protection"]
+    level["determined"] = 1
+    level["next_fault"] = 0.01, 0.1
+    complete = ended(level)
+    level["next_fault"] = 1e-5, 1e-4
+    np.testing.assert_array_equal(ended(level, of_learned=1), complete)
+    assert (ended(level) < complete).all()
 
 
 def test_a_source_that_is_less_certain_than_the_closed_form_does_not_raise_it():
