@@ -8,7 +8,7 @@ chance alone gives.
 
     no fault       |C_mm^-1 c_m|
     unseen fault   sqrt(tr V / 4): what could be there unseen; little where the readings would show it
-    seen fault     sqrt((e + 1/4) tr V) + (2 |m| + 6 |m - u|) min(1, e / 12)
+    seen fault     sqrt((e + 1/4) tr V) + (2 |m| + 6 |m - u|) min(1, e / 7)
 
 u is the usual m of the hypothesis, averaged over some 6 s. The 6 is for faults that grow: such a fault is larger at the end of
 the filter's memory than on average over it, and has moved the pose before, and goes on until the next evaluation. What lasts
@@ -47,7 +47,7 @@ _CHANCE = 1.0
 _UNSEEN = 0.25
 """Evidence ascribed to a fault for which there is less [-]."""
 
-_SURELY = 12.0
+_SURELY = 7.0
 """Evidence beyond chance from which on a fault is taken to be there."""
 
 _BENDING_S = 4.0

@@ -48,7 +48,7 @@ def level_of(state, frames, predicted, place, usual):
         faults.append(
             [
                 np.sqrt((seen + 0.25) * np.trace(spread[s, s]))
-                + (2.0 * np.linalg.norm(m[s]) + 6.0 * np.linalg.norm(new[s])) * min(1.0, seen / 12.0)
+                + (2.0 * np.linalg.norm(m[s]) + 6.0 * np.linalg.norm(new[s])) * min(1.0, seen / 7.0)
                 for s in (slice(0, 3), slice(3, 6))
             ]
         )
