@@ -111,5 +111,6 @@ def _follow_script(loop: PreparedLoop, late_percent: float = 0.0, seed: int = 0)
 def _first_enabled(records: Record) -> int:
     """The cycle in which the drives are first enabled, or the one after the last; 0 if there is none."""
     enabled = records["cycle"][records["request"] != 0]
-    after_last = records["cycle"][-1:] + 1
-    return int(np.append(enabled, np.append(after_last, 0))[0])
+    if len(enabled) > 0:
+        return int(enabled[0])
+    return int(records["cycle"][-1]) + 1 if len(records) > 0 else 0

@@ -167,17 +167,21 @@ def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
 
 @pytest.mark.slow
 def test_a_dry_run_reads_everything_and_moves_nothing(tmp_path):
-    recording = tmp_path / "x.mcap"
-    with emulated() as (_, at, control):
-        words = ("run", "--rig", "udp", "--rig-at", at, *MOTION, *PATIENT, "--duration", 2, "--no-arm", "--record", recording)
-        status, output, errors = finished(gough(*words))
-        assert status == 0, output + errors
-        assert "nothing was moved; all is well for arming" in output
-        lengths = state_of(control)["lengths"]
-    records = read(recording).records
-    # Before the first answer nothing is known of the drives. On a busy machine some answers are late.
-    answered = records[records["silent"] == 0]
-    assert (records["command"] == 0.0).all() and (records["mode"] == 0).all() and len(answered) > 0.5 * len(records)
+    """On a busy machine more answers are late than a tenth. Then there is another run."""
+    for attempt in range(4):
+        recording = tmp_path / f"{attempt}.mcap"
+        with emulated() as (_, at, control):
+            words = ("--rig", "udp", "--rig-at", at, *MOTION, *PATIENT, "--duration", 2, "--no-arm", "--record", recording)
+            status, output, errors = finished(gough("run", *words))
+            assert status == 0, output + errors
+            assert "nothing was moved; all is well for arming" in output
+            lengths = state_of(control)["lengths"]
+        records = read(recording).records
+        # Before the first answer nothing is known of the drives.
+        answered = records[records["silent"] == 0]
+        if len(answered) > 0.9 * len(records):
+            break
+    assert (records["command"] == 0.0).all() and (records["mode"] == 0).all() and len(answered) > 0.9 * len(records)
     assert (answered["drive"] != DriveState.FOLLOWING).all()
     assert np.isfinite(records["position"]).all()
     assert np.abs(records["truth"][0, TRUTH_LENGTHS] - lengths).max() < 1e-4
