@@ -128,7 +128,7 @@ def begin_level(s: Record, e: Record) -> None:
 
 @kernel
 def take_hypothesis(
-    s: Record, e: Record, hypothesis: int, count: int, first: int, last: int, found: float, new_share: float, t: Record
+    s: Record, e: Record, hypothesis: int, count: int, first: int, last: int, found: float, usual_share: float, t: Record
 ) -> None:  # fmt: skip
     """Take the effect of a hypothesis, for which `evidence_for` has just been called, if it is the greatest so far.
 
@@ -138,7 +138,7 @@ def take_hypothesis(
         count: of its directions.
         first, last: their span.
         found: the evidence.
-        new_share: of this evaluation in the usual error.
+        usual_share: of this evaluation in the usual error.
     """
     if s.determined == 0:
         return
@@ -170,7 +170,7 @@ def take_hypothesis(
             grown += (left - s.usual[hypothesis, i]) ** 2
             # What is no number would stay.
             if np.isfinite(left):
-                s.usual[hypothesis, i] += new_share * (left - s.usual[hypothesis, i])
+                s.usual[hypothesis, i] += usual_share * (left - s.usual[hypothesis, i])
             for n in range(count):
                 variance += s.effect[n, i] ** 2
         most = _LASTING * np.sqrt(squared) + _GROWN * np.sqrt(grown)

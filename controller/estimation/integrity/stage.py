@@ -27,7 +27,7 @@ PARAMETERS = record_dtype(
     cycles=np.int64,  # over which an evaluation is spread
     shared_noise=np.float64,  # variance of the noise that hypotheses about all IMUs see, as a multiple of an IMU's own
     correction_cycles=np.int64,  # how long the loop takes to correct the pose
-    new_share=np.float64,  # of an evaluation in the usual error of the pose
+    usual_share=np.float64,  # of an evaluation in the usual error of the pose
 )
 """Constants."""
 
@@ -119,7 +119,7 @@ def integrity_parameters(
         cycles=evidence.EVALUATION_WINDOWS * int(filtered["window"]),
         shared_noise=shared_noise,
         correction_cycles=round(_CORRECTION_S * rate),
-        new_share=evidence.EVALUATION_WINDOWS * float(filtered["duration"]) / protection.USUAL_S,
+        usual_share=evidence.EVALUATION_WINDOWS * float(filtered["duration"]) / protection.USUAL_S,
     )
 
 
@@ -198,7 +198,7 @@ def _do(p: Record, s: Record, rig: Record, imus: Record, step: int) -> None:
             s.found[h] /= p.shared_noise
         if e.of_learned == 0:
             # The first readings after a new beginning tell little.
-            share = p.new_share if s.filter.windows * p.filter.duration > fault_filter.MEMORY_S else 0.0
+            share = p.usual_share if s.filter.windows * p.filter.duration > fault_filter.MEMORY_S else 0.0
             protection.take_hypothesis(s.protection, e, h, count, first, last, s.found[h], share, t)
     else:
         at = step - _FIRST_TOTAL
