@@ -57,7 +57,7 @@ class Table:
 
         shown = RichTable(box=SIMPLE_HEAD, pad_edge=False)
         for i, heading in enumerate(self._flat_headings()):
-            shown.add_column(Text(heading), justify="left" if i in self._left else "right")
+            shown.add_column(Text(heading), justify="left" if i in self._left else "right", overflow="fold")
         for row in self.rows:
             shown.add_row(*(Text(cell.text, "bold red" if cell.alarm else "") for cell in row))
         return shown

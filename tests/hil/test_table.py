@@ -19,6 +19,14 @@ def test_the_terminal_shows_the_text_as_it_is(capsys):
     assert lines[3] == " estimate [a]                 0.1                22.5   a|b "
 
 
+def test_a_long_word_is_folded_and_never_cut_off(capsys):
+    faults = ",".join(f"base-tilt,axis=x,size_deg={n}" for n in range(9))
+    table = Table("name", "faults", left=(0, 1))
+    table.add("the base tilts", faults)
+    table.print()
+    assert "".join(line.removeprefix(" the base tilts").strip() for line in capsys.readouterr().out.splitlines()[3:]) == faults
+
+
 def test_columns_are_aligned_as_they_say_and_an_alarm_is_bold_and_red():
     rich = table().rich()
     assert [column.justify for column in rich.columns] == ["left", "right", "right", "left"]
