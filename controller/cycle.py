@@ -476,8 +476,8 @@ def _watch(parameters: Record, state: Record) -> int:
     rig, time, pose = p.rig, s.time, s.pose
     if p.integrity.filter.active != 0:
         commanded.compare_with_commands(
-            s.integrity.commanded, rig, time, follows_commands(s.safety), p.safety.drives.lag + p.load.command_delay, p.load,
-            s.load, pose, s.reference, s.pid.command,
+            s.integrity.commanded, rig, time, follows_commands(s.safety), s.encoders.counts.any(),
+            p.safety.drives.lag + p.load.command_delay, p.load, s.load, pose, s.reference, s.pid.command,
         )  # fmt: skip
     if follows_commands(s.safety):
         watch.check_oscillation(

@@ -13,6 +13,11 @@ least squares, so that what is wrong from the start is learned soon.
 
 No sensor measures the expected lengths; only the load depends on the estimate, and little. So an error that all IMUs share
 shows itself here, too.
+
+An error that comes up more slowly is followed. In motion the IMUs show it, at rest they need not: an error that the legs'
+accelerometers share looks like another height. The loop then holds the estimate where it is, and moves the platform. So at rest
+what is commanded is added up from the third second on, less the load's share and less the mean of the second and third second,
+which hold the legs still. It counts as motion that nothing else shows. When the platform moves again, it fades.
 """
 
 import numpy as np
@@ -29,6 +34,15 @@ from plant.vectors import dot, vector
 _FIRST_S, _LAST_S = 0.05, 1.5
 """The least and the greatest time constant with which offset and rate follow [s]."""
 
+_REST_MPS = 1e-6
+"""A leg whose reference is slower is at rest [m/s]."""
+
+_FROM_S, _TO_S = 1.0, 3.0
+"""From when to when after the begin of a rest the mean is taken that holds the legs still [s]."""
+
+_FADING_S = 5.0
+"""Time constant with which the motion at rest fades when the platform moves again [s]."""
+
 STATE = record_dtype(
     following=np.int64,  # whether command and offset are those of the last cycle
     age=np.float64,  # of the motion [s]
@@ -36,30 +50,36 @@ STATE = record_dtype(
     rate=(np.float64, LEGS),  # commanded, after the lag [m/s]
     offset=(np.float64, LEGS),  # x and the expected length together [m]
     offset_rate=(np.float64, LEGS),  # v [m/s]
-    left=(np.float64, 6),  # what is left of each length [m], and the platform's motion by it [m, rad]
-    jacobian=(np.float64, (6, 6)),  # scratch
+    left=(np.float64, LEGS),  # what is left of each length [m]
     moved=(np.float64, 2),  # by how much position [m] and rotation [rad] have moved otherwise
+    rest=np.float64,  # how long the reference has been at rest [s]
+    still=(np.float64, LEGS),  # commanded rate that holds each leg still [m/s]
+    creep=(np.float64, LEGS),  # what was commanded at rest beyond that [m]
+    crept=(np.float64, 2),  # by how much it has moved position [m] and rotation [rad]
+    jacobian=(np.float64, (6, 6)),  # scratch
+    motion=(np.float64, 6),  # scratch: of the platform
 )
 """The expected lengths, and how the estimate differs from them; zeros before the motion."""
 
 
 @kernel
 def compare_with_commands(
-    s: Record, rig: Record, time: Record, follows: bool, lag: float, feed_forward: Record, load: Record, pose: Record,
-    reference: Record, commands: Array,
+    s: Record, rig: Record, time: Record, follows: bool, measured: bool, lag: float, feed_forward: Record, load: Record,
+    pose: Record, reference: Record, commands: Array,
 ) -> None:  # fmt: skip
     """After the commands of a cycle: compare the estimated lengths with what the commands before have made of them.
 
     Args:
         s: dtype `STATE`.
         follows: whether the drives follow the commands.
+        measured: whether encoders measure the lengths, so that nothing moves unseen at rest.
         lag: of a leg behind its command, by drive and bus [s].
         feed_forward, load: dtypes `PARAMETERS` and `STATE` of `load_feed_forward`.
         commands: (6,) [m/s].
     """
     if not follows:
         s.following = 0
-        s.moved[:] = 0.0
+        s.moved[:] = s.crept[:] = s.creep[:] = s.rest = 0.0
         return
     if s.following == 0:
         s.following = 1
@@ -68,6 +88,7 @@ def compare_with_commands(
         s.offset_rate[:] = s.age = 0.0
     else:
         _compare(s, rig, elapsed(rig, time), lag, feed_forward, load, pose, reference)
+        _add_creep(s, rig, elapsed(rig, time), measured, feed_forward, load, pose, reference)
     s.command[:] = commands
 
 
@@ -84,10 +105,38 @@ def _compare(
         s.left[k] = pose.lengths[k] - s.offset[k]
         s.offset[k] += share * (2.0 - share) * s.left[k]
         s.offset_rate[k] += 1.5 * share**2 / duration * s.left[k]
+    _move_platform(s, rig, pose, s.left, s.moved)
+
+
+@kernel
+def _add_creep(
+    s: Record, rig: Record, duration: float, measured: bool, feed_forward: Record, load: Record, pose: Record, reference: Record
+) -> None:  # fmt: skip
+    still = True
+    for k in range(rig.legs):
+        still = still and abs(reference.motion[k, 1]) < _REST_MPS
+    before, s.rest = s.rest, s.rest + duration if still and not measured else 0.0
+    for k in range(rig.legs):
+        rate = s.rate[k] - feed_forward.droop * load.drive[k]
+        if not still or measured:
+            s.creep[k] -= min(1.0, duration / _FADING_S) * s.creep[k]
+        elif before >= _TO_S:
+            s.creep[k] += duration * (rate - s.still[k])
+        elif before < _FROM_S:
+            s.still[k] = rate
+        else:
+            s.still[k] += duration / (s.rest - _FROM_S) * (rate - s.still[k])
+    _move_platform(s, rig, pose, s.creep, s.crept)
+
+
+@kernel
+def _move_platform(s: Record, rig: Record, pose: Record, lengths: Array, moved: Array) -> None:
+    """Write by how much changes of lengths (6,) move position and rotation; infinite if the legs do not determine the pose."""
     jacobian_at(pose.arms, pose.directions, rig.legs, s.jacobian)
-    if solve_square(s.jacobian, s.left) > RANK_TOLERANCE:
+    s.motion[:] = lengths
+    if solve_square(s.jacobian, s.motion) > RANK_TOLERANCE:
         for part in range(2):
-            motion = vector(s.left[3 * part :])
-            s.moved[part] = np.sqrt(dot(motion, motion))
+            motion = vector(s.motion[3 * part :])
+            moved[part] = np.sqrt(dot(motion, motion))
     else:
-        s.moved[:] = np.inf
+        moved[:] = np.inf

@@ -15,7 +15,7 @@ the filter's memory than on average over it, and has moved the pose before, and 
 has grown already: the gyroscopes of IMUs that get warm together show a small error all the time. A fault since the loop began
 has had little time to move the pose: these terms grow over the first four seconds.
 
-The level is the root of the sum of the squares of eight terms:
+The level is the root of the sum of the squares of nine terms:
 
 1. The greatest of these.
 2. The standard deviation of the pose, both that of the closed form and that of the pose's own source if that is less: no filter
@@ -29,8 +29,10 @@ The level is the root of the sum of the squares of eight terms:
 7. How far the pose in closed form and that of the whole-mechanism filter are from each other.
 8. How far the pose has drifted from the one that gravity shows, as `gravity` has it: so errors that all gyroscopes share show
    themselves while the filters still take them for motion.
+9. How far the platform may have crept at rest, as `commanded` has it: there the IMUs need not show a slow error.
 
-Terms 3 to 8 are renewed in every cycle; term 6 is that of the cycle before, and term 8 changes with the fault filter's windows.
+Terms 3 to 9 are renewed in every cycle; terms 6 and 9 are those of the cycle before, and term 8 changes with the fault filter's
+windows.
 """
 
 import numpy as np
@@ -208,8 +210,8 @@ def end_level(s: Record, e: Record, age: float) -> None:
 
 @kernel
 def publish_level(
-    s: Record, misfit: float, duration: float, steady: float, shaken: float, bent: Array, moved: Array, apart: Array,
-    drifted: Array,
+    s: Record, misfit: float, duration: float, steady: float, shaken: float, bent: Array, moved: Array, crept: Array,
+    apart: Array, drifted: Array,
 ) -> None:  # fmt: skip
     """Publish the level of a cycle, with what has come up since the last evaluation.
 
@@ -221,6 +223,7 @@ def publish_level(
         shaken: greatest mean square of vibration [m^2/s^4], `shaking.STATE`.
         bent: (2,), by how much an encoder could move position [m] and rotation [rad] unseen.
         moved: (2,), by how much they have moved otherwise than commanded, `commanded.STATE`.
+        crept: (2,), by how much they may have crept at rest, `commanded.STATE`.
         apart: (2,), how far the closed form and the filter that is trusted are from each other.
         drifted: (2,), how far position and rotation have drifted from what gravity shows, `gravity.STATE`.
     """
@@ -228,7 +231,8 @@ def publish_level(
     beyond = _OF_MISFIT**2 * max(s.misfit - _USUAL_MISFIT, 0.0)
     force = min(max(steady - _SOUND, 0.0) + _SHAKEN * np.sqrt(shaken), _MOST)
     for part in range(2):
-        squared = s.evaluated[part] + beyond * s.closed[part] + (_BY_FORCE[part] * force) ** 2 + bent[part] ** 2
+        squared = s.evaluated[part] + beyond * s.closed[part] + (_BY_FORCE[part] * force) ** 2
+        squared += bent[part] ** 2 + crept[part] ** 2
         squared += (_OF_MOVED[part] * max(moved[part] - _USUALLY_MOVED[part], 0.0)) ** 2
         squared += (_OF_APART * max(apart[part] - _USUALLY_APART[part], 0.0)) ** 2
         squared += (_OF_DRIFTED[part] * max(drifted[part] - _USUALLY_DRIFTED[part] * np.sqrt(s.closed[part]), 0.0)) ** 2

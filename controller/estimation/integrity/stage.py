@@ -147,7 +147,7 @@ def step_integrity(
     if s.evaluations > 0:
         protection.publish_level(
             s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max(), pose.bent,
-            s.commanded.moved, pose.apart, s.gravity.drifted,
+            s.commanded.moved, s.commanded.crept, pose.apart, s.gravity.drifted,
         )  # fmt: skip
     if s.waits > 0:
         s.waits -= 1

@@ -16,14 +16,15 @@ NOT = (0.0, 0.0)
 
 
 def ended(
-    level, age=50.0, of_learned=0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, apart=NOT, drifted=NOT
-):
+    level, age=50.0, of_learned=0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, crept=NOT, apart=NOT,
+    drifted=NOT,
+):  # fmt: skip
     """The level (2,) at the end of an evaluation, with a misfit that lasts."""
     level["covariance"], level["misfit"] = own, misfit
     evidence = np.zeros((), STATE)
     evidence["of_learned"] = of_learned
     end_level(level[()], evidence[()], age)
-    publish_level(level[()], misfit, 0.01, steady, shaken, *(np.array(each) for each in (bent, moved, apart, drifted)))
+    publish_level(level[()], misfit, 0.01, steady, shaken, *(np.array(each) for each in (bent, moved, crept, apart, drifted)))
     return level["level"].copy()
 
 
@@ -145,6 +146,7 @@ def test_what_was_not_commanded_and_two_estimates_that_are_apart_raise_the_level
     np.testing.assert_array_equal(ended(level, moved=(1.5e-4, 1.5e-3), apart=(5e-4, 2e-3)), sound)
     np.testing.assert_allclose(ended(level, moved=(1.15e-3, 3.5e-3)), np.hypot(sound, [2.2e-3, 3.6e-3]))
     np.testing.assert_allclose(ended(level, apart=(1.5e-3, 12e-3)), np.hypot(sound, [0.8e-3, 8e-3]))
+    np.testing.assert_allclose(ended(level, crept=(3e-3, 5e-3)), np.hypot(sound, [3e-3, 5e-3]))
 
 
 def test_a_drift_from_what_gravity_shows_raises_the_level_beyond_what_calibrations_leave():
@@ -165,7 +167,7 @@ def test_measurements_that_contradict_each_other_raise_the_level_between_evaluat
     np.testing.assert_allclose(ended(level, misfit=2.3), np.sqrt(calm**2 + 1.6**2 * 2.0 * closed))
     # A misfit that has just come up counts by its share of the average.
     level["misfit"] = 0.3
-    publish_level(level[()], 2.3, 0.01, 0.0, 0.0, *np.zeros((4, 2)))
+    publish_level(level[()], 2.3, 0.01, 0.0, 0.0, *np.zeros((5, 2)))
     np.testing.assert_allclose(level["level"], np.sqrt(calm**2 + 1.6**2 * 0.2 * closed))
     assert np.isinf(ended(level, own=np.full_like(OWN, np.inf), misfit=2.3)).all()
 
