@@ -16,8 +16,8 @@ shows itself here, too.
 
 An error that comes up more slowly is followed. In motion the IMUs show it, at rest they need not: an error that the legs'
 accelerometers share looks like another height. The loop then holds the estimate where it is, and moves the platform. So at rest
-what is commanded is added up from the third second on, less the load's share and less the mean of the second and third second,
-which hold the legs still. It counts as motion that nothing else shows. When the platform moves again, it fades.
+what is commanded is added up, less the load's share and less the mean of 1 to 2.5 s after the begin of the rest, which holds
+the legs still. The farthest that it has moved the platform counts. When the platform moves again, it fades.
 """
 
 import numpy as np
@@ -37,7 +37,7 @@ _FIRST_S, _LAST_S = 0.05, 1.5
 _REST_MPS = 1e-6
 """A leg whose reference is slower is at rest [m/s]."""
 
-_FROM_S, _TO_S = 1.0, 3.0
+_FROM_S, _TO_S = 1.0, 2.5
 """From when to when after the begin of a rest the mean is taken that holds the legs still [s]."""
 
 _FADING_S = 5.0
@@ -55,9 +55,10 @@ STATE = record_dtype(
     rest=np.float64,  # how long the reference has been at rest [s]
     still=(np.float64, LEGS),  # commanded rate that holds each leg still [m/s]
     creep=(np.float64, LEGS),  # what was commanded at rest beyond that [m]
-    crept=(np.float64, 2),  # by how much it has moved position [m] and rotation [rad]
+    crept=(np.float64, 2),  # by how much it has moved position [m] and rotation [rad] at most
     jacobian=(np.float64, (6, 6)),  # scratch
     motion=(np.float64, 6),  # scratch: of the platform
+    now=(np.float64, 2),  # scratch: by how much it has moved them by now
 )
 """The expected lengths, and how the estimate differs from them; zeros before the motion."""
 
@@ -112,21 +113,30 @@ def _compare(
 def _add_creep(
     s: Record, rig: Record, duration: float, measured: bool, feed_forward: Record, load: Record, pose: Record, reference: Record
 ) -> None:  # fmt: skip
-    still = True
+    still = not measured
     for k in range(rig.legs):
         still = still and abs(reference.motion[k, 1]) < _REST_MPS
-    before, s.rest = s.rest, s.rest + duration if still and not measured else 0.0
+    if not still:
+        s.rest = 0.0
+        fades = min(1.0, duration / _FADING_S)
+        for k in range(rig.legs):
+            s.creep[k] -= fades * s.creep[k]
+        for part in range(2):
+            s.crept[part] -= fades * s.crept[part]
+        return
+    before, s.rest = s.rest, s.rest + duration
     for k in range(rig.legs):
         rate = s.rate[k] - feed_forward.droop * load.drive[k]
-        if not still or measured:
-            s.creep[k] -= min(1.0, duration / _FADING_S) * s.creep[k]
-        elif before >= _TO_S:
+        if before >= _TO_S:
             s.creep[k] += duration * (rate - s.still[k])
         elif before < _FROM_S:
             s.still[k] = rate
         else:
             s.still[k] += duration / (s.rest - _FROM_S) * (rate - s.still[k])
-    _move_platform(s, rig, pose, s.creep, s.crept)
+    if before >= _TO_S:
+        _move_platform(s, rig, pose, s.creep, s.now)
+        for part in range(2):
+            s.crept[part] = max(s.crept[part], s.now[part])
 
 
 @kernel

@@ -88,6 +88,9 @@ _USUALLY_MOVED, _OF_MOVED = (1.5e-4, 1.5e-3), (2.2, 1.8)
 _USUALLY_APART, _OF_APART = (5e-4, 2e-3), 0.8
 """The distance of the two estimates counts beyond the first [m, rad], so many times."""
 
+_OF_CREPT = 1.3
+"""So many times counts what has crept at rest: the begin of a fault may be in the mean of the commands that hold the legs."""
+
 _USUALLY_DRIFTED, _OF_DRIFTED = (0.3, 0.7), (3.0, 2.5)
 """The drift from what gravity shows counts beyond so many standard deviations of the closed form, so many times."""
 
@@ -232,7 +235,7 @@ def publish_level(
     force = min(max(steady - _SOUND, 0.0) + _SHAKEN * np.sqrt(shaken), _MOST)
     for part in range(2):
         squared = s.evaluated[part] + beyond * s.closed[part] + (_BY_FORCE[part] * force) ** 2
-        squared += bent[part] ** 2 + crept[part] ** 2
+        squared += bent[part] ** 2 + (_OF_CREPT * crept[part]) ** 2
         squared += (_OF_MOVED[part] * max(moved[part] - _USUALLY_MOVED[part], 0.0)) ** 2
         squared += (_OF_APART * max(apart[part] - _USUALLY_APART[part], 0.0)) ** 2
         squared += (_OF_DRIFTED[part] * max(drifted[part] - _USUALLY_DRIFTED[part] * np.sqrt(s.closed[part]), 0.0)) ** 2

@@ -161,7 +161,7 @@ def test_at_rest_what_is_commanded_beyond_what_holds_the_legs_still_counts_as_mo
     random, loop = np.random.default_rng(seed), Compared()
     load, shares = loop.state["load"], float(loop.parameters["load"]["droop"])
     holding, speed, spin = random.normal(0.0, 0.003, 6), random.normal(0.0, 1e-3, 3), random.normal(0.0, 5e-3, 3)
-    for n in range(round(3.0 / PERIOD_S) + 2):
+    for n in range(round(2.5 / PERIOD_S) + 2):
         # The first second is that of a loop that still settles.
         loop.cycle(holding + (0.01 if n * PERIOD_S < 0.9 else 0.0))
         assert loop.crept.max() < 1e-7
@@ -180,7 +180,7 @@ def test_at_rest_what_is_commanded_beyond_what_holds_the_legs_still_counts_as_mo
 def test_what_has_crept_fades_in_motion_and_a_rest_begins_anew_after_it():
     loop = Compared()
     for n in range(round(5.0 / PERIOD_S)):
-        loop.cycle(0.002 if n * PERIOD_S > 3.1 else 0.0)
+        loop.cycle(0.002 if n * PERIOD_S > 2.6 else 0.0)
     crept, rates = loop.crept, loop.state["reference"]["motion"][:, 1]
     assert crept[0] > 3e-3
     rates[2] = 1e-3
@@ -188,7 +188,7 @@ def test_what_has_crept_fades_in_motion_and_a_rest_begins_anew_after_it():
         loop.cycle()
     np.testing.assert_allclose(loop.crept, np.exp(-1.0) * crept, rtol=1e-3, atol=1e-12)
     crept, rates[2] = loop.crept, 0.0
-    for n in range(round(2.9 / PERIOD_S)):
+    for n in range(round(2.4 / PERIOD_S)):
         loop.cycle(0.001 * (n % 3))
     np.testing.assert_array_equal(loop.crept, crept)
     loop.cycle(follows=False)
@@ -198,7 +198,7 @@ def test_what_has_crept_fades_in_motion_and_a_rest_begins_anew_after_it():
 def test_nothing_creeps_where_encoders_measure_the_legs():
     loop = Compared()
     for n in range(round(5.0 / PERIOD_S)):
-        loop.cycle(0.002 if n * PERIOD_S > 3.1 else 0.0, measured=True)
+        loop.cycle(0.002 if n * PERIOD_S > 2.6 else 0.0, measured=True)
     assert (loop.crept == 0.0).all()
 
 
