@@ -14,10 +14,11 @@ least squares, so that what is wrong from the start is learned soon.
 No sensor measures the expected lengths; only the load depends on the estimate, and little. So an error that all IMUs share
 shows itself here, too.
 
-An error that comes up more slowly is followed. In motion the IMUs show it, at rest they need not: an error that the legs'
-accelerometers share looks like another height. The loop then holds the estimate where it is, and moves the platform. So at rest
-what is commanded is added up, less the load's share and less the mean of 1 to 2.5 s after the begin of the rest, which holds
-the legs still. The farthest that it has moved the platform counts. When the platform moves again, it fades.
+Offset and rate follow an error that comes up more slowly. In motion the IMUs show such an error. At rest they need not: one
+that the legs' accelerometers share looks like another height. The loop then holds the estimate, and so moves the platform. So
+at rest the commands are added up, less the load's share, and less their mean from 1 to 2.5 s after the begin of the rest, which
+holds the legs still. This sum is a creep of the legs. What counts is the farthest that the creep has moved the platform. When
+the platform moves again, both fade.
 """
 
 import numpy as np
@@ -38,10 +39,10 @@ _REST_MPS = 1e-6
 """A leg whose reference is slower is at rest [m/s]."""
 
 _FROM_S, _TO_S = 1.0, 2.5
-"""From when to when after the begin of a rest the mean is taken that holds the legs still [s]."""
+"""The mean of the commands between these times after the begin of a rest holds the legs still [s]."""
 
 _FADING_S = 5.0
-"""Time constant with which the motion at rest fades when the platform moves again [s]."""
+"""Time constant with which the creep fades when the platform moves again [s]."""
 
 STATE = record_dtype(
     following=np.int64,  # whether command and offset are those of the last cycle
@@ -118,11 +119,9 @@ def _add_creep(
         still = still and abs(reference.motion[k, 1]) < _REST_MPS
     if not still:
         s.rest = 0.0
-        fades = min(1.0, duration / _FADING_S)
-        for k in range(rig.legs):
-            s.creep[k] -= fades * s.creep[k]
-        for part in range(2):
-            s.crept[part] -= fades * s.crept[part]
+        left = max(0.0, 1.0 - duration / _FADING_S)
+        s.creep[:] *= left
+        s.crept[:] *= left
         return
     before, s.rest = s.rest, s.rest + duration
     for k in range(rig.legs):
@@ -136,7 +135,9 @@ def _add_creep(
     if before >= _TO_S:
         _move_platform(s, rig, pose, s.creep, s.now)
         for part in range(2):
-            s.crept[part] = max(s.crept[part], s.now[part])
+            # Where the legs do not determine the pose, `moved` is infinite as well, and this must not stay so.
+            if s.now[part] < np.inf:
+                s.crept[part] = max(s.crept[part], s.now[part])
 
 
 @kernel

@@ -195,6 +195,18 @@ def test_what_has_crept_fades_in_motion_and_a_rest_begins_anew_after_it():
     assert (loop.crept == 0.0).all()
 
 
+def test_where_the_legs_did_not_determine_the_pose_for_a_while_the_creep_is_known_again():
+    loop = Compared()
+    directions = loop.state["pose"]["directions"].copy()
+    for n in range(round(3.0 / PERIOD_S)):
+        loop.cycle(0.002 if n * PERIOD_S > 2.6 else 0.0)
+    loop.state["pose"]["directions"] = [0.0, 0.0, 1.0]
+    assert np.isinf(loop.cycle(0.002)).all()
+    loop.state["pose"]["directions"] = directions
+    loop.cycle(0.002)
+    assert 0.0 < loop.crept[0] < 2e-3 and loop.crept[1] < 1e-6
+
+
 def test_nothing_creeps_where_encoders_measure_the_legs():
     loop = Compared()
     for n in range(round(5.0 / PERIOD_S)):
