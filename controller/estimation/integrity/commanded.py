@@ -120,8 +120,10 @@ def _add_creep(
     if not still:
         s.rest = 0.0
         left = max(0.0, 1.0 - duration / _FADING_S)
-        s.creep[:] *= left
-        s.crept[:] *= left
+        for k in range(rig.legs):
+            s.creep[k] *= left
+        for part in range(2):
+            s.crept[part] *= left
         return
     before, s.rest = s.rest, s.rest + duration
     for k in range(rig.legs):

@@ -350,16 +350,18 @@ def test_the_process_of_a_loop_loads_no_design_or_plotting_library():
     assert run.stdout.strip() == "[] []"
 
 
-def test_the_loop_allocates_nothing_per_cycle():
+@pytest.mark.parametrize(("target", "first"), [("sines", 210), ("hold", 2800)])
+def test_the_loop_allocates_nothing_per_cycle(target, first):
+    """At rest, too, after the 2.5 s from which on commands are added up."""
     code = (
         "from hil.runs.config import SimulationConfig\nfrom hil.runs.prepare import prepared_loop\n"
         "from numba.core.runtime import rtsys\n"
-        "with prepared_loop(SimulationConfig(target='sines', duration=1.0)) as loop:\n"
-        "    counts = [rtsys.get_allocation_stats().alloc]\n"
-        "    for last in (210, 220, 1200):\n"
+        f"with prepared_loop(SimulationConfig(target='{target}', duration=4.0)) as loop:\n"
+        "    counts = []\n"
+        f"    for last in ({first}, {first + 10}, {first + 1000}):\n"
         "        loop.run(last)\n"
         "        counts.append(rtsys.get_allocation_stats().alloc)\n"
-        "print(counts[2] - counts[1], counts[3] - counts[2])\n"
+        "print(counts[1] - counts[0], counts[2] - counts[1])\n"
     )
     environment = os.environ | {"NUMBA_NRT_STATS": "1"}
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
