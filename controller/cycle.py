@@ -37,7 +37,7 @@ from controller.estimation import (
     platform_filter,
     pose_estimator,
 )
-from controller.estimation.integrity import commanded
+from controller.estimation.integrity import commanded, rest
 from controller.estimation.integrity import stage as integrity
 from controller.estimation.integrity.protection import end_level
 from controller.estimation.whole_mechanism import trust
@@ -476,9 +476,14 @@ def _watch(parameters: Record, state: Record) -> int:
     rig, time, pose = p.rig, s.time, s.pose
     if p.integrity.filter.active != 0:
         commanded.compare_with_commands(
-            s.integrity.commanded, rig, time, follows_commands(s.safety), s.encoders.counts.any(),
-            p.safety.drives.lag + p.load.command_delay, p.load, s.load, pose, s.reference, s.pid.command,
+            s.integrity.commanded, rig, time, follows_commands(s.safety), p.safety.drives.lag + p.load.command_delay, p.load,
+            s.load, pose, s.reference, s.pid.command,
         )  # fmt: skip
+        rest.compare_at_rest(
+            s.integrity.rest, rig, elapsed(rig, time), follows_commands(s.safety), s.encoders.counts.any(),
+            s.integrity.commanded.rate, p.load.droop, s.load.drive, s.integrity.parity.twist, pose, s.reference,
+        )  # fmt: skip
+        watch.check_rest(p.safety, s.safety, rig, time, s.integrity.rest.both, s.reference, s.pid)
     if follows_commands(s.safety):
         watch.check_oscillation(
             p.safety, s.safety, rig, time, s.imus.shaking, s.load.feed_forward, s.reference, s.pid

@@ -215,6 +215,12 @@ class Cause(IntEnum):
     )
 
     TWO_FORCES = 74, "two IMUs or more read a force that is no motion", Reaction.QUICK_STOP, "m/s^2"
+    MOVES_AT_REST = (
+        83,
+        "commands and gyroscopes show a motion at rest, and the estimate does not: accelerometers share an error",
+        Reaction.QUICK_STOP,
+        "m RMS of the legs",
+    )
     BASE_SWING = 75, "the base joint of leg {} would swing too far for the target", Reaction.STOP, "rad"
     PLATFORM_SWING = 76, "the platform joint of leg {} would swing too far for the target", Reaction.STOP, "rad"
     TOO_CLOSE = 77, "the target would bring leg {} too close to another leg or a plate", Reaction.STOP, "m"

@@ -4,6 +4,7 @@ import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
 from controller.estimation.integrity.parity import OF_TWO, SHARED
+from controller.estimation.integrity.rest import AT_REST
 from controller.rig import elapsed
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
@@ -314,6 +315,16 @@ def check_level(p: Record, s: Record, rig: Record, time: Record, level: Array, r
     for part, cause in enumerate((Cause.POSITION_UNSURE.value, Cause.ROTATION_UNSURE.value)):
         if s.mode == Mode.RUNNING and not level[part] <= p.watch.level[part]:
             handle_cause(p, s, rig, time, reference, pid, cause, -1, level[part], p.watch.level[part])
+
+
+@kernel
+def check_rest(p: Record, s: Record, rig: Record, time: Record, both: float, reference: Record, pid: Record) -> None:
+    """At rest: stop when commands and gyroscopes show a motion of the platform, as `rest` has it [m RMS of the legs].
+
+    If `evidence` has no limit, nothing happens.
+    """
+    if s.mode == Mode.RUNNING and both > AT_REST and np.isfinite(p.watch.evidence):
+        handle_cause(p, s, rig, time, reference, pid, Cause.MOVES_AT_REST, -1, both, AT_REST)
 
 
 @kernel

@@ -29,7 +29,7 @@ The level is the root of the sum of the squares of nine terms:
 7. How far the pose in closed form and that of the whole-mechanism filter are from each other.
 8. How far the pose has drifted from the one that gravity shows, as `gravity` has it: so errors that all gyroscopes share show
    themselves while the filters still take them for motion.
-9. How far the platform may have crept at rest, as `commanded` has it: there the IMUs need not show a slow error.
+9. How far the platform may have crept at rest, as `rest` has it: there the IMUs need not show a slow error.
 
 Terms 3 to 9 are renewed in every cycle; terms 6 and 9 are those of the cycle before, and term 8 changes with the fault filter's
 windows.
@@ -226,7 +226,7 @@ def publish_level(
         shaken: greatest mean square of vibration [m^2/s^4], `shaking.STATE`.
         bent: (2,), by how much an encoder could move position [m] and rotation [rad] unseen.
         moved: (2,), by how much they have moved otherwise than commanded, `commanded.STATE`.
-        crept: (2,), by how much they may have crept at rest, `commanded.STATE`.
+        crept: (2,), by how much they may have crept at rest, `rest.STATE`.
         apart: (2,), how far the closed form and the filter that is trusted are from each other.
         drifted: (2,), how far position and rotation have drifted from what gravity shows, `gravity.STATE`.
     """

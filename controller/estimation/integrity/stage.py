@@ -4,7 +4,16 @@ every hypothesis.
 
 import numpy as np
 
-from controller.estimation.integrity import commanded, evidence, fault_filter, gravity, hypotheses, parity, protection
+from controller.estimation.integrity import (
+    commanded,
+    evidence,
+    fault_filter,
+    gravity,
+    hypotheses,
+    parity,
+    protection,
+    rest,
+)
 from controller.estimation.integrity.hypotheses import (
     HYPOTHESES,
     OF_ONE_IMU,
@@ -39,6 +48,7 @@ STATE = record_dtype(
     commanded=commanded.STATE,
     gravity=gravity.STATE,
     parity=parity.STATE,
+    rest=rest.STATE,
     compared=np.int64,  # the last window of which the gyroscopes have been compared
     contradicts=np.int64,  # whether they contradict each other, or accelerometers show no motion, found in this cycle
     waits=np.int64,  # for how many more cycles what is read counts for the gyroscopes' parity alone
@@ -147,7 +157,7 @@ def step_integrity(
     if s.evaluations > 0:
         protection.publish_level(
             s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max(), pose.bent,
-            s.commanded.moved, s.commanded.crept, pose.apart, s.gravity.drifted,
+            s.commanded.moved, s.rest.crept, pose.apart, s.gravity.drifted,
         )  # fmt: skip
     if s.waits > 0:
         s.waits -= 1
@@ -175,6 +185,7 @@ def restart_integrity(p: Record, s: Record) -> None:
     or many periods have been missed. What was learned before it stays.
     """
     s.waits = p.correction_cycles
+    rest.forget_motion(s.rest)
     evidence.end_blur(p.evidence, s.evidence, s.step)
     s.step = s.cycle = 0
     fault_filter.begin_anew(s.filter)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from controller.cycle import hear_rig
+from controller.estimation.integrity.rest import AT_REST
 from controller.inverse_kinematics import leg_lengths
 from controller.safety import watch_nothing
 from controller.safety.causes import Cause, DriveState, Mode, Request
@@ -16,6 +17,7 @@ from controller.safety.watch import (
     check_limits,
     check_misfit,
     check_oscillation,
+    check_rest,
     exclude_imu,
     judge_evidence,
     judge_parity,
@@ -702,6 +704,26 @@ def test_two_imus_that_read_a_force_that_is_no_motion_end_a_run(two):
     )  # fmt: skip
     expected = (Cause.TWO_FORCES, -1, 0.3, 0.2) if two else (Cause.FORCES_SHARE, -1, 0.2, 0.1)
     assert stop_of(state) == tuple(pytest.approx(each) if isinstance(each, float) else each for each in expected)
+
+
+@pytest.mark.parametrize(
+    ("both", "mode", "evidence", "stops"),
+    [
+        (2.1e-3, Mode.RUNNING, 6.0, True),
+        (1.9e-3, Mode.RUNNING, 6.0, False),
+        (2.1e-3, Mode.STOPPING, 6.0, False),
+        (2.1e-3, Mode.RUNNING, np.inf, False),
+    ],
+)
+def test_a_motion_at_rest_ends_a_run_that_is_judged(both, mode, evidence, stops):
+    _, parameters, state = moving(mode=mode)
+    p, s = parameters, state
+    p["safety"]["watch"]["evidence"] = evidence
+    check_rest(p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], both, s["reference"][()], s["pid"][()])
+    if stops:
+        assert stop_of(state) == (Cause.MOVES_AT_REST, -1, both, AT_REST)
+    else:
+        assert state["safety"]["stop"]["cause"] == Cause.NONE
 
 
 @pytest.mark.parametrize("limit", [np.inf, 0.05])
