@@ -221,6 +221,7 @@ class Cause(IntEnum):
         Reaction.QUICK_STOP,
         "m RMS of the legs",
     )
+    DRIFTS = 84, "the pose drifts from the one that gravity shows: gyroscopes share an error", Reaction.QUICK_STOP, "sigma"
     BASE_SWING = 75, "the base joint of leg {} would swing too far for the target", Reaction.STOP, "rad"
     PLATFORM_SWING = 76, "the platform joint of leg {} would swing too far for the target", Reaction.STOP, "rad"
     TOO_CLOSE = 77, "the target would bring leg {} too close to another leg or a plate", Reaction.STOP, "m"

@@ -73,6 +73,11 @@ _OSCILLATING_S = 1.0
 _BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0
 """How long there may be no reading of the base's IMU, and how long the first one may take [s]."""
 
+_DRIFT, _DRIFTING_S, _FIRST_DRIFT_S = 3.0, 1.0, 3.0
+"""How far the pose may drift from what gravity shows [standard deviations of the closed form], for how long that must last, and
+from when in the motion on it is looked at [s]: the reference is of one window at first.
+"""
+
 PARAMETERS = record_dtype(
     most_lost_imus=np.int64,
     conditioning=np.float64,
@@ -101,6 +106,7 @@ STATE = record_dtype(
     contradicted_for=np.float64,  # how long the IMUs have contradicted each other [s]
     unjudged=np.int64,  # whether there has been no evidence for too long
     unfit_for=np.float64,  # how long no pose has fitted the IMUs [s]
+    drifting_for=np.float64,  # how long the pose has been too far from what gravity shows [s]
     without_platform_imu=np.float64,  # for how long the platform's IMU, where there is one, has been left out [s]
     off_reference_for=(np.float64, LEGS),  # how long each leg has been off its reference [s]
     deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
@@ -325,6 +331,25 @@ def check_rest(p: Record, s: Record, rig: Record, time: Record, both: float, ref
     """
     if s.mode == Mode.RUNNING and both > AT_REST and np.isfinite(p.watch.evidence):
         handle_cause(p, s, rig, time, reference, pid, Cause.MOVES_AT_REST, -1, both, AT_REST)
+
+
+@kernel
+def check_drift(
+    p: Record, s: Record, rig: Record, time: Record, shaking: Record, integrity: Record, reference: Record, pid: Record
+) -> None:
+    """Stop when the pose has drifted from the one that gravity shows, as `gravity` has it: the gyroscopes share an error.
+
+    While IMUs are shaken, accelerometers do not show gravity. If `evidence` has no limit, nothing happens.
+    """
+    drift, closed, furthest = integrity.gravity.drifted, integrity.protection.closed, 0.0
+    for part in range(2):
+        if closed[part] > 0.0:
+            furthest = max(furthest, drift[part] / np.sqrt(closed[part]))
+    calm = shaking.told == 0 and shaking.bridging == 0
+    lasts = furthest > _DRIFT and integrity.gravity.age > _FIRST_DRIFT_S and calm
+    s.watch.drifting_for = s.watch.drifting_for + elapsed(rig, time) if lasts else 0.0
+    if s.watch.drifting_for > _DRIFTING_S and s.mode == Mode.RUNNING and np.isfinite(p.watch.evidence):
+        handle_cause(p, s, rig, time, reference, pid, Cause.DRIFTS, -1, furthest, _DRIFT)
 
 
 @kernel

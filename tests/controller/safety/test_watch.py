@@ -13,6 +13,7 @@ from controller.safety.causes import Cause, DriveState, Mode, Request
 from controller.safety.stop import describe_end
 from controller.safety.watch import (
     check_carried,
+    check_drift,
     check_judgement,
     check_limits,
     check_misfit,
@@ -722,6 +723,44 @@ def test_a_motion_at_rest_ends_a_run_that_is_judged(both, mode, evidence, stops)
     check_rest(p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], both, s["reference"][()], s["pid"][()])
     if stops:
         assert stop_of(state) == (Cause.MOVES_AT_REST, -1, both, AT_REST)
+    else:
+        assert state["safety"]["stop"]["cause"] == Cause.NONE
+
+
+@pytest.mark.parametrize("part", [0, 1])
+@pytest.mark.parametrize(
+    ("sigmas", "change", "stops"),
+    [
+        (3.1, "", True),
+        (2.9, "", False),
+        (3.1, "told", False),
+        (3.1, "bridging", False),
+        (3.1, "age", False),
+        (3.1, "evidence", False),
+    ],
+)
+def test_a_pose_that_drifts_from_what_gravity_shows_for_a_second_ends_a_run(part, sigmas, change, stops):
+    _, parameters, state = moving()
+    p, s, integrity = parameters, state, state["integrity"]
+    integrity["protection"]["closed"] = [1e-6, 4e-6]
+    integrity["gravity"]["drifted"][part] = sigmas * (1e-3, 2e-3)[part]
+    integrity["gravity"]["age"] = 2.9 if change == "age" else 3.1
+    p["safety"]["watch"]["evidence"] = np.inf if change == "evidence" else 6.0
+    if change in ("told", "bridging"):
+        state["imus"]["shaking"][change] = 1
+
+    def cycles(seconds):
+        for _ in range(round(seconds / PERIOD_S)):
+            check_drift(
+                p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], s["imus"]["shaking"][()], integrity[()],
+                s["reference"][()], s["pid"][()],
+            )  # fmt: skip
+
+    cycles(0.99)
+    assert state["safety"]["stop"]["cause"] == Cause.NONE
+    cycles(0.02)
+    if stops:
+        assert stop_of(state) == (Cause.DRIFTS, -1, pytest.approx(sigmas), 3.0)
     else:
         assert state["safety"]["stop"]["cause"] == Cause.NONE
 
