@@ -422,7 +422,8 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         integrity.restart_integrity(p.integrity, s.integrity)
     if p.integrity.filter.active != 0:
         watch.check_judgement(p.safety, s.safety, rig, time, s.integrity, s.reference, s.pid)
-        watch.check_drift(p.safety, s.safety, rig, time, s.imus.shaking, s.integrity, s.reference, s.pid)
+        if not s.encoders.counts.any():
+            watch.check_drift(p.safety, s.safety, rig, time, s.imus.shaking, s.integrity, s.reference, s.pid)
     if s.integrity.fresh != 0:
         level = s.integrity.protection
         trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])

@@ -36,8 +36,10 @@ _NOISE_S = 0.02
 _SHAKEN_HZ = 400.0
 """Below this rate motion shows in second differences."""
 
-_NOISIER = 3.0
-"""How much noisier than the others an IMU must be: what shakes all of them is no fault of one."""
+_NOISIER, _REMEMBERED_S = 3.0, 5.0
+"""How much noisier than the others an IMU must be: what shakes all of them is no fault of one. As their samples may beat with a
+vibration, and so look quiet for a while, the noise of the others fades with the second [s].
+"""
 
 PARAMETERS = record_dtype(
     present=(np.int64, IMU_COUNT),  # which IMUs there are
@@ -46,6 +48,7 @@ PARAMETERS = record_dtype(
     range=(np.float64, 2),  # of gyroscope and accelerometer; the end of which is invalid [rad/s, m/s^2]
     noise=(np.float64, 2),  # limits of gyroscope and accelerometer, RMS [rad/s, m/s^2]
     noise_smoothing=np.float64,  # share of a new sample in the average
+    remembering=np.float64,  # what is left after a cycle of the noise of late
     frozen_cycles=np.int64,  # these three: the durations above
     healthy_cycles=np.int64,
     stale_cycles=np.int64,
@@ -68,6 +71,7 @@ STATE = record_dtype(
     earlier=(np.float64, (2, 2, IMU_COUNT, 3)),  # the last two raw samples
     variance=(np.float64, (2, IMU_COUNT)),  # of each sensor's noise, averaged
     noise=(np.float64, IMU_COUNT),  # of each IMU over its limit
+    recent_noise=(np.float64, IMU_COUNT),  # the greatest of late, fading
     shaking=shaking.STATE,
 )
 """State of the IMUs."""
@@ -88,6 +92,7 @@ def imu_parameters(
         range=(fusion.gyroscope_range, fusion.accelerometer_range),
         noise=np.array([safety.gyroscope_noise, safety.accelerometer_noise]) * max(1.0, shaken**2),
         noise_smoothing=min(0.05, 1.0 / (rate * _NOISE_S)),
+        remembering=np.exp(-1.0 / (rate * _REMEMBERED_S)),
         frozen_cycles=max(3, round(_FROZEN_S * rate)),
         healthy_cycles=round(_HEALTHY_S * rate),
         stale_cycles=max(3, round(_STALE_S * rate)),
@@ -125,7 +130,8 @@ def screen_imus(
                     most = max(most, abs(raw - s.raw[kind, k, i]))
         changed += p.present[k] != 0 and most > _ROUNDING
         _update_noise(p, s, time.cycle, measurement, k)
-        total_noise += s.noise[k]
+        s.recent_noise[k] = max(s.noise[k], p.remembering * s.recent_noise[k])
+        total_noise += s.recent_noise[k]
     fastest = 0.0
     for k in range(rig.legs):
         fastest = max(fastest, abs(motion[k, 1]))
@@ -149,7 +155,8 @@ def screen_imus(
         elif s.frozen_for[k] >= p.frozen_cycles:
             cause, value, limit = Cause.IMU_FROZEN.value, float(s.frozen_for[k]), float(p.frozen_cycles)
         noise = s.noise[k]
-        if cause == Cause.NONE and noise > max(1.0, _NOISIER * (total_noise - noise) / rig.legs):
+        of_others = (total_noise - s.recent_noise[k]) / rig.legs
+        if cause == Cause.NONE and noise > max(1.0, _NOISIER * of_others):
             cause, value, limit = Cause.IMU_NOISY.value, noise, 1.0
         finite, reached = True, 0.0
         for kind in range(3):

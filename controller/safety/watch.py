@@ -73,9 +73,10 @@ _OSCILLATING_S = 1.0
 _BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0
 """How long there may be no reading of the base's IMU, and how long the first one may take [s]."""
 
-_DRIFT, _DRIFTING_S, _FIRST_DRIFT_S = 3.0, 1.0, 3.0
-"""How far the pose may drift from what gravity shows [standard deviations of the closed form], for how long that must last, and
-from when in the motion on it is looked at [s]: the reference is of one window at first.
+_DRIFT, _DRIFTING_S, _FIRST_DRIFT_S, _CALM_S = 3.0, 1.0, 3.0, 10.0
+"""How far the pose may drift from what gravity shows [standard deviations of the closed form], and for how long [s]. It is not
+looked at in the first seconds of the motion, as the reference is of one window at first, nor for some seconds after the IMUs
+were shaken, as the filters have learned from that.
 """
 
 PARAMETERS = record_dtype(
@@ -106,7 +107,7 @@ STATE = record_dtype(
     contradicted_for=np.float64,  # how long the IMUs have contradicted each other [s]
     unjudged=np.int64,  # whether there has been no evidence for too long
     unfit_for=np.float64,  # how long no pose has fitted the IMUs [s]
-    drifting_for=np.float64,  # how long the pose has been too far from what gravity shows [s]
+    drifting_for=np.float64,  # how long the pose has been too far from what gravity shows; below 0: IMUs were shaken [s]
     without_platform_imu=np.float64,  # for how long the platform's IMU, where there is one, has been left out [s]
     off_reference_for=(np.float64, LEGS),  # how long each leg has been off its reference [s]
     deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
@@ -337,7 +338,8 @@ def check_rest(p: Record, s: Record, rig: Record, time: Record, both: float, ref
 def check_drift(
     p: Record, s: Record, rig: Record, time: Record, shaking: Record, integrity: Record, reference: Record, pid: Record
 ) -> None:
-    """Stop when the pose has drifted from the one that gravity shows, as `gravity` has it: the gyroscopes share an error.
+    """Without encoders: stop when the pose has drifted from the one that gravity shows, as `gravity` has it. The gyroscopes then
+    share an error.
 
     While IMUs are shaken, accelerometers do not show gravity. If `evidence` has no limit, nothing happens.
     """
@@ -345,10 +347,12 @@ def check_drift(
     for part in range(2):
         if closed[part] > 0.0:
             furthest = max(furthest, drift[part] / np.sqrt(closed[part]))
-    calm = shaking.told == 0 and shaking.bridging == 0
-    lasts = furthest > _DRIFT and integrity.gravity.age > _FIRST_DRIFT_S and calm
-    s.watch.drifting_for = s.watch.drifting_for + elapsed(rig, time) if lasts else 0.0
-    if s.watch.drifting_for > _DRIFTING_S and s.mode == Mode.RUNNING and np.isfinite(p.watch.evidence):
+    w, lasts = s.watch, furthest > _DRIFT and integrity.gravity.age > _FIRST_DRIFT_S
+    if shaking.told != 0 or shaking.bridging != 0:
+        w.drifting_for = -_CALM_S
+    else:
+        w.drifting_for = w.drifting_for + elapsed(rig, time) if lasts or w.drifting_for < 0.0 else 0.0
+    if w.drifting_for > _DRIFTING_S and s.mode == Mode.RUNNING and np.isfinite(p.watch.evidence):
         handle_cause(p, s, rig, time, reference, pid, Cause.DRIFTS, -1, furthest, _DRIFT)
 
 

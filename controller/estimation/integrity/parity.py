@@ -4,8 +4,9 @@ All gyroscopes see one motion. Let z (21) be the mean readings of a window less 
 twist is wrong by t (6), sound gyroscopes give z = J t. So what least squares leaves, e = z - J t, shows errors of gyroscopes
 alone. Let H = J (J^T J)^-1 J^T, with the block H_k of IMU k. Without this IMU, the sum of squares is less by
 e_k^T (I - H_k)^-1 e_k (Cook and Weisberg, Residuals and influence in regression, 1982). The root of this is how far its
-gyroscope is off, however much the fit follows it. A gyroscope is named if the rest agrees without it. What a gyroscope has been
-off for many seconds is no large error: it is left to the evidence.
+gyroscope is off, however much the fit follows it. A gyroscope is named if the rest agrees without it, unless a base that turns,
+which gives J three more columns, explains them better. What a gyroscope has been off for many seconds is no large error: it is
+left to the evidence.
 
 From one window to the next, t changes with the acceleration that was not planned, averaged with weights that rise in the first
 window and fall in the second one. If the forces, averaged alike, show more than that, it is no motion: it is vibration, or
@@ -24,8 +25,8 @@ from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 
-_TWIST, _FIRST = 6, 6
-"""Size of the twist, and its place in the states of the motion."""
+_TWIST, _FIRST, _WITH_BASE = 6, 6, 9
+"""Size of the twist, its place in the states of the motion, and its size together with the base's rate."""
 
 _LIMIT = radians(0.55)
 """Error of an angular velocity that is told: several times what calibrated gyroscopes have [rad/s]."""
@@ -79,9 +80,12 @@ STATE = record_dtype(
     average=(np.float64, (IMU_COUNT, 3)),  # of these forces, in the axes of the IMUs [m/s^2]
     twist_before=(np.float64, _TWIST),  # of the window before
     force_before=(np.float64, (IMU_COUNT, 3)),  # its part in the forces beyond the planned acceleration and the twist
-    normal=(np.float64, (_TWIST, _TWIST)),  # from here on scratch
-    covariance=(np.float64, (_TWIST, _TWIST)),  # of the twist, for gyroscopes of variance 1
-    twist=(np.float64, _TWIST),
+    twist=(np.float64, _TWIST),  # of this one, beyond the planned one
+    normal=(np.float64, (_WITH_BASE, _WITH_BASE)),  # from here on scratch
+    covariance=(np.float64, (_WITH_BASE, _WITH_BASE)),  # of what is fitted, for gyroscopes of variance 1
+    fit=(np.float64, _WITH_BASE),  # twist and base's rate
+    row=(np.float64, _WITH_BASE),  # of J
+    known=(np.float64, _WITH_BASE),
     left=(np.float64, (3, 3)),
     residual=(np.float64, 3),
     solved=(np.float64, 3),
@@ -90,30 +94,35 @@ STATE = record_dtype(
 
 
 @kernel
-def step_parity(s: Record, f: Record, excluded: Array, samples: int, period: float, shaking: Record) -> bool:
+def step_parity(s: Record, f: Record, excluded: Array, frames: Array, samples: int, period: float, shaking: Record) -> bool:
     """Look at the last full window, once its readings are predicted; returns whether gyroscopes contradict each other.
 
     Args:
         s: dtype `STATE`.
         f: dtype `fault_filter.STATE`.
         excluded: (7,), which IMUs have been left out.
+        frames: (7, 3, 3), axes of the IMUs in {1} by rows, of late: zeros if they are not known yet.
         samples: of an IMU in a window.
         period: of the samples [s].
         shaking: dtype `shaking.STATE`. Its `no_motion` is written: the variance of a sample that stands for what an
             accelerometer reads that is no motion [m^2/s^4]; all samples of a window share it. 0 within the limit.
     """
     duration = samples * period
-    s.worst, s.error = _find_worst(s, f, excluded, -1)
+    worst, s.error = _find_worst(s, f, excluded, -1, frames, _TWIST)
+    s.worst = max(worst, 0)
+    s.twist[:] = s.fit[:_TWIST]
     s.limit = _LIMIT + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
     if s.error <= s.limit:
-        _learn_usual(s, f, excluded, duration / _USUAL_S)
+        _learn_usual(s, f, excluded, frames, duration / _USUAL_S)
     _compare_forces(s, f, excluded, samples, duration, shaking)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
         return False
     s.off_for = 0
-    _, without = _find_worst(s, f, excluded, s.worst)
-    s.named = without < max(_AGREE * s.limit, _AGREE_OF_ALL * s.error)
+    _, without = _find_worst(s, f, excluded, s.worst, frames, _TWIST)
+    fits, on_turning_base = _find_worst(s, f, excluded, -1, frames, _WITH_BASE)
+    agrees = without < max(_AGREE * s.limit, _AGREE_OF_ALL * s.error)
+    s.named = agrees and not (fits >= 0 and on_turning_base < without)
     return True
 
 
@@ -123,64 +132,78 @@ def _counts(f: Record, excluded: Array, k: int) -> bool:
 
 
 @kernel
-def _find_worst(s: Record, f: Record, excluded: Array, left_out: int) -> tuple[int, float]:
-    """Fit the twist to all gyroscopes but one; returns which is off most, and by how much.
+def _find_worst(s: Record, f: Record, excluded: Array, left_out: int, frames: Array, unknowns: int) -> tuple[int, float]:
+    """Fit the twist, or with 9 unknowns the base's rate as well, to all gyroscopes but one; returns which is off most, and by
+    how much.
 
-    The error is 0 where too few are left to contradict each other.
+    The error is 0, and the gyroscope -1, where too few are left to contradict each other.
     """
     used = 0
-    s.normal[:] = 0.0
-    s.twist[:] = 0.0
+    normal, covariance, fit = s.normal[:unknowns, :unknowns], s.covariance[:unknowns, :unknowns], s.fit[:unknowns]
+    normal[:] = 0.0
+    fit[:] = 0.0
     for k in range(IMU_COUNT):
         if not _counts(f, excluded, k) or k == left_out:
             continue
         used += 1
         for m in range(3):
-            row = f.jacobian[k, m]
+            _find_row(s, f, frames, k, m)
             off = f.mean[k, m] - f.predicted[k, m] - s.usual[k, m]
-            for i in range(_TWIST):
-                share = row[_FIRST + i]
-                s.twist[i] += share * off
+            for i in range(unknowns):
+                fit[i] += s.row[i] * off
                 for j in range(i + 1):
-                    s.normal[i, j] += share * row[_FIRST + j]
-    if 3 * used <= _TWIST or not factor_cholesky(s.normal):
-        s.twist[:] = 0.0
-        return 0, 0.0
-    solve_cholesky(s.normal, s.twist)
-    invert_cholesky(s.normal, s.covariance)
+                    normal[i, j] += s.row[i] * s.row[j]
+    if 3 * used <= unknowns or not factor_cholesky(normal):
+        fit[:] = 0.0
+        return -1, 0.0
+    solve_cholesky(normal, fit)
+    invert_cholesky(normal, covariance)
     worst, most = 0, 0.0
     for k in range(IMU_COUNT):
         if _counts(f, excluded, k) and k != left_out:
-            squared = _squared_error(s, f, k)
+            squared = _squared_error(s, f, frames, k, unknowns)
             if squared > most:
                 worst, most = k, squared
     return worst, float(np.sqrt(most))
 
 
 @kernel
-def _find_residual(s: Record, f: Record, k: int) -> None:
-    """What the fitted twist leaves of a gyroscope's reading, into `residual`."""
+def _find_row(s: Record, f: Record, frames: Array, k: int, m: int) -> None:
+    """The row of J for an axis of a gyroscope: what twist and base's rate add to its reading."""
+    for i in range(_TWIST):
+        s.row[i] = f.jacobian[k, m, _FIRST + i]
+    for i in range(_WITH_BASE - _TWIST):
+        s.row[_TWIST + i] = frames[k, m, i]
+
+
+@kernel
+def _find_residual(s: Record, f: Record, frames: Array, k: int, unknowns: int) -> None:
+    """What the fit leaves of a gyroscope's reading, into `residual`."""
     for m in range(3):
+        _find_row(s, f, frames, k, m)
         off = f.mean[k, m] - f.predicted[k, m] - s.usual[k, m]
-        for i in range(_TWIST):
-            off -= f.jacobian[k, m, _FIRST + i] * s.twist[i]
+        for i in range(unknowns):
+            off -= s.row[i] * s.fit[i]
         s.residual[m] = off
 
 
 @kernel
-def _squared_error(s: Record, f: Record, k: int) -> float:
+def _squared_error(s: Record, f: Record, frames: Array, k: int, unknowns: int) -> float:
     """By how much the sum of squares is less without a gyroscope; 0 if nothing else knows what it reads."""
-    _find_residual(s, f, k)
+    _find_residual(s, f, frames, k, unknowns)
     for m in range(3):
-        row = f.jacobian[k, m]
+        _find_row(s, f, frames, k, m)
         for n in range(m + 1):
             s.left[m, n] = 1.0 if n == m else 0.0
-        for i in range(_TWIST):
+        for i in range(unknowns):
             known = 0.0
-            for j in range(_TWIST):
-                known += s.covariance[i, j] * row[_FIRST + j]
-            for n in range(m + 1):
-                s.left[m, n] -= f.jacobian[k, n, _FIRST + i] * known
+            for j in range(unknowns):
+                known += s.covariance[i, j] * s.row[j]
+            s.known[i] = known
+        for n in range(m + 1):
+            _find_row(s, f, frames, k, n)
+            for i in range(unknowns):
+                s.left[m, n] -= s.row[i] * s.known[i]
         s.solved[m] = s.residual[m]
     if not factor_cholesky(s.left) or min(s.left[0, 0], s.left[1, 1], s.left[2, 2]) < _LEAST_LEFT:
         return 0.0
@@ -209,10 +232,10 @@ def _unplanned_turning(s: Record, f: Record, duration: float) -> float:
 
 
 @kernel
-def _learn_usual(s: Record, f: Record, excluded: Array, share: float) -> None:
+def _learn_usual(s: Record, f: Record, excluded: Array, frames: Array, share: float) -> None:
     for k in range(IMU_COUNT):
         if _counts(f, excluded, k):
-            _find_residual(s, f, k)
+            _find_residual(s, f, frames, k, _TWIST)
             for m in range(3):
                 s.usual[k, m] += share * s.residual[m]
 

@@ -150,7 +150,9 @@ def step_integrity(
     if s.filter.job > 0 and s.compared != s.filter.windows:
         s.compared = s.filter.windows
         s.contradicts = s.filter.windows > 0 and (
-            parity.step_parity(s.parity, s.filter, imus.excluded, p.filter.window, rig.period, imus.shaking)
+            parity.step_parity(
+                s.parity, s.filter, imus.excluded, s.hypotheses.frames, p.filter.window, rig.period, imus.shaking
+            )
             or s.parity.shared != 0
             or s.parity.two != 0
         )

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from controller.estimation.integrity.parity import step_parity
+from controller.estimation.whole_mechanism.readings import find_frames
 from tests.controller.estimation.integrity.made_up import RATE_HZ, constants, filtered, readings
 
 LIMIT = np.radians(0.55)
@@ -12,12 +13,14 @@ LIMIT = np.radians(0.55)
 def parity(state):
     """Whether gyroscopes contradict each other in the last window."""
     s, imus = state["integrity"], state["imus"]
-    return bool(step_parity(s["parity"][()], s["filter"][()], imus["excluded"], 5, 1.0 / RATE_HZ, imus["shaking"][()]))
+    frames, shaking = s["hypotheses"]["frames"], imus["shaking"][()]
+    return bool(step_parity(s["parity"][()], s["filter"][()], imus["excluded"], frames, 5, 1.0 / RATE_HZ, shaking))
 
 
-def look(imu=None, fault=(0.0, 0.0, 0.0), kind="0.5", lost=(), excluded=(), windows=3, sensor=0, state=None):
+def look(imu=None, fault=(0.0, 0.0, 0.0), kind="0.5", lost=(), excluded=(), windows=3, sensor=0, state=None, made=None):
     """The parity's state after some windows, and what each has returned; `imu` reads a `fault` too much, or all with None."""
     mechanism, r = readings(kind, 1.0, 2)
+    r = r if made is None else made
     r.samples[:, sensor, slice(None) if imu is None else imu] += fault
     parameters, fresh = constants(mechanism)
     state = fresh if state is None else state
@@ -67,6 +70,37 @@ def test_sound_gyroscopes_agree(kind):
     s, told = look(kind=kind, windows=90)
     assert not any(told)
     assert s["parity"]["error"] < 0.5 * LIMIT
+
+
+def frames_of(mechanism, r):
+    """The axes of the IMUs (7, 3, 3) in the base frame, by rows, at the first pose."""
+    parameters, state = constants(mechanism)
+    frames = np.zeros((7, 3, 3))
+    path = state["integrity"]["filter"]["path"]
+    path["position"], path["rotation"] = r.positions[0], r.rotations[0]
+    find_frames(parameters["rig"]["sensors"][()], path["position"], path["rotation"], frames)
+    return frames
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_on_a_base_that_turns_no_gyroscope_is_named(axis):
+    mechanism, r = readings("0.5", 1.0, 2)
+    frames = frames_of(mechanism, r)
+    r.samples[:, 0] += frames @ (0.15 * np.eye(3)[axis])
+    _, state = constants(mechanism)
+    state["integrity"]["hypotheses"]["frames"] = frames
+    s, told = look(state=state, made=r)
+    assert told[1] and s["parity"]["error"] > s["parity"]["limit"]
+    assert not s["parity"]["named"]
+
+
+@pytest.mark.parametrize("imu", range(7))
+def test_a_gyroscope_that_is_a_little_off_is_not_taken_for_a_base_that_turns(imu):
+    mechanism, r = readings("0.5", 1.0, 2)
+    _, state = constants(mechanism)
+    state["integrity"]["hypotheses"]["frames"] = frames_of(mechanism, r)
+    s, told = look(imu, (0.0, 0.0, 2.0 * LIMIT), state=state)
+    assert told[1] and s["parity"]["worst"] == imu and s["parity"]["named"]
 
 
 def test_two_that_are_off_are_not_taken_for_one():
