@@ -5,8 +5,8 @@ twist is wrong by t (6), sound gyroscopes give z = J t. So what least squares le
 alone. Let H = J (J^T J)^-1 J^T, with the block H_k of IMU k. Without this IMU, the sum of squares is less by
 e_k^T (I - H_k)^-1 e_k (Cook and Weisberg, Residuals and influence in regression, 1982). The root of this is how far its
 gyroscope is off, however much the fit follows it. A gyroscope is named if the rest agrees without it, unless a base that turns,
-which gives J three more columns, explains them better. What a gyroscope has been off for many seconds is no large error: it is
-left to the evidence.
+which gives J three more columns, explains them about as well. What a gyroscope has been off for many seconds is no large error:
+it is left to the evidence.
 
 From one window to the next, t changes with the acceleration that was not planned, averaged with weights that rise in the first
 window and fall in the second one. If the forces, averaged alike, show more than that, it is no motion: it is vibration, or
@@ -42,6 +42,9 @@ _USUAL_S = 10.0
 
 _AGREE, _AGREE_OF_ALL = 0.6, 0.15
 """How large the error without the named gyroscope may be: of the limit, and of the error with it."""
+
+_AS_WELL = 2.0
+"""A base that turns explains the gyroscopes if it leaves less than so many times what is left without the named one."""
 
 _LEAST_LEFT = 1e-4
 """A gyroscope's axis is known from the others if this share of an error there would be left over."""
@@ -122,7 +125,7 @@ def step_parity(s: Record, f: Record, excluded: Array, frames: Array, samples: i
     _, without = _find_worst(s, f, excluded, s.worst, frames, _TWIST)
     fits, on_turning_base = _find_worst(s, f, excluded, -1, frames, _WITH_BASE)
     agrees = without < max(_AGREE * s.limit, _AGREE_OF_ALL * s.error)
-    s.named = agrees and not (fits >= 0 and on_turning_base < without)
+    s.named = agrees and not (fits >= 0 and on_turning_base < _AS_WELL * without)
     return True
 
 
