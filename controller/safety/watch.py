@@ -338,7 +338,7 @@ def check_rest(p: Record, s: Record, rig: Record, time: Record, both: float, ref
 def check_drift(
     p: Record, s: Record, rig: Record, time: Record, shaking: Record, integrity: Record, reference: Record, pid: Record
 ) -> None:
-    """Without encoders: stop when the pose has drifted from the one that gravity shows, as `gravity` has it, as gyroscopes share
+    """Without encoders: stop when the pose has drifted from the one that gravity shows, as `gravity` has it: gyroscopes share
     an error.
 
     While IMUs are shaken, accelerometers do not show gravity. If `evidence` has no limit, nothing happens.
