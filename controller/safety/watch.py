@@ -73,9 +73,9 @@ _OSCILLATING_S = 1.0
 _BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0
 """How long there may be no reading of the base's IMU, and how long the first one may take [s]."""
 
-_DRIFT, _DRIFTING_S, _FIRST_DRIFT_S, _CALM_S = 3.0, 1.0, 3.0, 10.0
+_DRIFT, _DRIFTING_S, _FIRST_DRIFT_S, _CALM_S = 3.0, 1.0, 10.0, 10.0
 """How far the pose may drift from what gravity shows [standard deviations of the closed form], and for how long [s]. It is not
-looked at in the first seconds of the motion, as the reference is of one window at first, nor for some seconds after the IMUs
+looked at in the first seconds of the motion, in which the filters learn, nor for some seconds after the IMUs
 were shaken, as the filters have learned from that.
 """
 
