@@ -87,7 +87,7 @@ STATE = record_dtype(
     normal=(np.float64, (_WITH_BASE, _WITH_BASE)),  # from here on scratch
     covariance=(np.float64, (_WITH_BASE, _WITH_BASE)),  # of what is fitted, for gyroscopes of variance 1
     fit=(np.float64, _WITH_BASE),  # twist and base's rate
-    row=(np.float64, _WITH_BASE),  # of J
+    rows=(np.float64, (IMU_COUNT, 3, _WITH_BASE)),  # of J: what the twist adds to each reading, and the base's rate
     known=(np.float64, _WITH_BASE),
     left=(np.float64, (3, 3)),
     residual=(np.float64, 3),
@@ -111,19 +111,21 @@ def step_parity(s: Record, f: Record, excluded: Array, frames: Array, samples: i
             accelerometer reads that is no motion [m^2/s^4]; all samples of a window share it. 0 within the limit.
     """
     duration = samples * period
-    worst, s.error = _find_worst(s, f, excluded, -1, frames, _TWIST)
+    s.rows[:, :, :_TWIST] = f.jacobian[:, :3, _FIRST : _FIRST + _TWIST]
+    s.rows[:, :, _TWIST:] = frames
+    worst, s.error = _find_worst(s, f, excluded, -1, _TWIST)
     s.worst = max(worst, 0)
     s.twist[:] = s.fit[:_TWIST]
     s.limit = _LIMIT + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
     if s.error <= s.limit:
-        _learn_usual(s, f, excluded, frames, duration / _USUAL_S)
+        _learn_usual(s, f, excluded, duration / _USUAL_S)
     _compare_forces(s, f, excluded, samples, duration, shaking)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
         return False
     s.off_for = 0
-    _, without = _find_worst(s, f, excluded, s.worst, frames, _TWIST)
-    fits, on_turning_base = _find_worst(s, f, excluded, -1, frames, _WITH_BASE)
+    _, without = _find_worst(s, f, excluded, s.worst, _TWIST)
+    fits, on_turning_base = _find_worst(s, f, excluded, -1, _WITH_BASE)
     agrees = without < max(_AGREE * s.limit, _AGREE_OF_ALL * s.error)
     s.named = agrees and not (fits >= 0 and on_turning_base < _AS_WELL * without)
     return True
@@ -135,7 +137,7 @@ def _counts(f: Record, excluded: Array, k: int) -> bool:
 
 
 @kernel
-def _find_worst(s: Record, f: Record, excluded: Array, left_out: int, frames: Array, unknowns: int) -> tuple[int, float]:
+def _find_worst(s: Record, f: Record, excluded: Array, left_out: int, unknowns: int) -> tuple[int, float]:
     """Fit the twist, or with 9 unknowns the base's rate as well, to all gyroscopes but one; returns which is off most, and by
     how much.
 
@@ -150,12 +152,12 @@ def _find_worst(s: Record, f: Record, excluded: Array, left_out: int, frames: Ar
             continue
         used += 1
         for m in range(3):
-            _find_row(s, f, frames, k, m)
+            row = s.rows[k, m]
             off = f.mean[k, m] - f.predicted[k, m] - s.usual[k, m]
             for i in range(unknowns):
-                fit[i] += s.row[i] * off
+                fit[i] += row[i] * off
                 for j in range(i + 1):
-                    normal[i, j] += s.row[i] * s.row[j]
+                    normal[i, j] += row[i] * row[j]
     if 3 * used <= unknowns or not factor_cholesky(normal):
         fit[:] = 0.0
         return -1, 0.0
@@ -164,49 +166,37 @@ def _find_worst(s: Record, f: Record, excluded: Array, left_out: int, frames: Ar
     worst, most = 0, 0.0
     for k in range(IMU_COUNT):
         if _counts(f, excluded, k) and k != left_out:
-            squared = _squared_error(s, f, frames, k, unknowns)
+            squared = _squared_error(s, f, k, unknowns)
             if squared > most:
                 worst, most = k, squared
     return worst, float(np.sqrt(most))
 
 
 @kernel
-def _find_row(s: Record, f: Record, frames: Array, k: int, m: int) -> None:
-    """The row of J for an axis of a gyroscope: what twist and base's rate add to its reading."""
-    for i in range(_TWIST):
-        s.row[i] = f.jacobian[k, m, _FIRST + i]
-    for i in range(_WITH_BASE - _TWIST):
-        s.row[_TWIST + i] = frames[k, m, i]
-
-
-@kernel
-def _find_residual(s: Record, f: Record, frames: Array, k: int, unknowns: int) -> None:
+def _find_residual(s: Record, f: Record, k: int, unknowns: int) -> None:
     """What the fit leaves of a gyroscope's reading, into `residual`."""
     for m in range(3):
-        _find_row(s, f, frames, k, m)
         off = f.mean[k, m] - f.predicted[k, m] - s.usual[k, m]
         for i in range(unknowns):
-            off -= s.row[i] * s.fit[i]
+            off -= s.rows[k, m, i] * s.fit[i]
         s.residual[m] = off
 
 
 @kernel
-def _squared_error(s: Record, f: Record, frames: Array, k: int, unknowns: int) -> float:
+def _squared_error(s: Record, f: Record, k: int, unknowns: int) -> float:
     """By how much the sum of squares is less without a gyroscope; 0 if nothing else knows what it reads."""
-    _find_residual(s, f, frames, k, unknowns)
+    _find_residual(s, f, k, unknowns)
     for m in range(3):
-        _find_row(s, f, frames, k, m)
         for n in range(m + 1):
             s.left[m, n] = 1.0 if n == m else 0.0
         for i in range(unknowns):
             known = 0.0
             for j in range(unknowns):
-                known += s.covariance[i, j] * s.row[j]
+                known += s.covariance[i, j] * s.rows[k, m, j]
             s.known[i] = known
         for n in range(m + 1):
-            _find_row(s, f, frames, k, n)
             for i in range(unknowns):
-                s.left[m, n] -= s.row[i] * s.known[i]
+                s.left[m, n] -= s.rows[k, n, i] * s.known[i]
         s.solved[m] = s.residual[m]
     if not factor_cholesky(s.left) or min(s.left[0, 0], s.left[1, 1], s.left[2, 2]) < _LEAST_LEFT:
         return 0.0
@@ -235,10 +225,10 @@ def _unplanned_turning(s: Record, f: Record, duration: float) -> float:
 
 
 @kernel
-def _learn_usual(s: Record, f: Record, excluded: Array, frames: Array, share: float) -> None:
+def _learn_usual(s: Record, f: Record, excluded: Array, share: float) -> None:
     for k in range(IMU_COUNT):
         if _counts(f, excluded, k):
-            _find_residual(s, f, frames, k, _TWIST)
+            _find_residual(s, f, k, _TWIST)
             for m in range(3):
                 s.usual[k, m] += share * s.residual[m]
 
