@@ -106,6 +106,17 @@ def test_a_fault_has_had_as_much_time_as_the_loop_to_move_the_pose():
         np.testing.assert_allclose(ended(level, age), np.hypot(without, share * fault))
 
 
+@pytest.mark.parametrize(("age", "times"), [(0.0, 1.25), (2.0, 1.125), (4.0, 1.0), (50.0, 1.0)])
+def test_while_the_filters_settle_the_standard_deviations_count_more(age, times):
+    _, state = evaluated()
+    level = state["integrity"]["protection"]
+    level["determined"] = 1
+    level["next_fault"] = 0.0
+    closed, own = traces()
+    expected = np.sqrt([0.5**2, 1.4**2] * closed + [2.5**2, 1.4**2] * np.minimum(own, closed))
+    np.testing.assert_allclose(ended(level, age), times * expected)
+
+
 def test_an_evaluation_that_was_not_ended_takes_nothing_away():
     """Its greatest fault so far is not that of all hypotheses; what follows may be an evaluation of what was learned."""
     _, state = evaluated()
