@@ -423,7 +423,7 @@ def _check_integrity(parameters: Record, state: Record) -> None:
     if p.integrity.filter.active != 0:
         watch.check_judgement(p.safety, s.safety, rig, time, s.integrity, s.reference, s.pid)
         if not s.encoders.counts.any():
-            watch.check_drift(p.safety, s.safety, rig, time, s.imus.shaking, s.integrity, s.reference, s.pid)
+            watch.check_drift(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid)
     if s.integrity.fresh != 0:
         level = s.integrity.protection
         trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])
@@ -483,7 +483,8 @@ def _watch(parameters: Record, state: Record) -> int:
         )  # fmt: skip
         rest.compare_at_rest(
             s.integrity.rest, rig, elapsed(rig, time), follows_commands(s.safety), s.encoders.counts.any(),
-            s.integrity.commanded.rate, p.load.droop, s.load.drive, s.integrity.parity.twist, pose, s.reference,
+            s.integrity.commanded.rate, p.load.droop, s.load.drive, s.integrity.parity.twist,
+            2 * s.safety.watch.used_imus + s.mechanism.trusted, pose, s.reference,
         )  # fmt: skip
         watch.check_rest(p.safety, s.safety, rig, time, s.integrity.rest.both, s.reference, s.pid)
     if follows_commands(s.safety):

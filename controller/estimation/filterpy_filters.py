@@ -10,7 +10,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 
 from controller.estimation import shaking
 from controller.estimation.excess import INNOVATION_LIMIT, MEMORY_S
-from controller.estimation.leg_filter import runs, start_leg, update_leg_directions
+from controller.estimation.leg_filter import start_leg, update_leg_directions
 from controller.estimation.platform_filter import (
     BIAS,
     CORRELATION_S,
@@ -254,7 +254,7 @@ class FilterpyFilters:
         p, s = self._parameters, state[()]
         imus, legs = s["imus"], s["legs"]
         for k, leg in enumerate(self._legs):
-            if not runs(imus, k, legs["age"][k]):
+            if not imus["used"][k]:
                 continue
             rate, force = imus["sample"][GYROSCOPE, k], imus["sample"][ACCELEROMETER, k]
             if legs["age"][k] == 0:

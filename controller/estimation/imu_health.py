@@ -36,9 +36,12 @@ _NOISE_S = 0.02
 _SHAKEN_HZ = 400.0
 """Below this rate motion shows in second differences."""
 
-_NOISIER, _REMEMBERED_S = 3.0, 5.0
-"""How much noisier than the others an IMU must be: what shakes all of them is no fault of one. As their samples may beat with a
-vibration, and so look quiet for a while, the noise of the others fades with the second [s].
+_NOISIER = 3.0
+"""How much noisier than the others an IMU must be: what shakes all of them is no fault of one."""
+
+_REMEMBERED_S, _MOST_REMEMBERED = 5.0, 10.0
+"""The noise of the others is remembered, as samples that beat with a vibration look quiet for a while: time constant [s], and
+the most that is remembered, in limits.
 """
 
 PARAMETERS = record_dtype(
@@ -108,8 +111,8 @@ def screen_imus(
 
     An IMU is left out while its readings are not finite or noisy, at the end of their range for longer than others can bridge,
     or while the rig answers without a new sample of it. It is also left out while its readings are frozen although others
-    change or the legs must have moved. It is used again when it has been healthy for a while. An IMU that contradicted the
-    others stays out.
+    change or the legs must have moved. It is used again when it has been healthy for a while, and no IMU is shaken. An IMU that
+    contradicted the others stays out.
 
     Args:
         silent: for how many cycles the rig has not answered.
@@ -130,8 +133,8 @@ def screen_imus(
                     most = max(most, abs(raw - s.raw[kind, k, i]))
         changed += p.present[k] != 0 and most > _ROUNDING
         _update_noise(p, s, time.cycle, measurement, k)
-        s.recent_noise[k] = max(s.noise[k], p.remembering * s.recent_noise[k])
-        total_noise += s.recent_noise[k]
+        s.recent_noise[k] = max(min(s.noise[k], _MOST_REMEMBERED), p.remembering * s.recent_noise[k])
+        total_noise += s.recent_noise[k] if s.used[k] != 0 else 0.0
     fastest = 0.0
     for k in range(rig.legs):
         fastest = max(fastest, abs(motion[k, 1]))
@@ -155,7 +158,7 @@ def screen_imus(
         elif s.frozen_for[k] >= p.frozen_cycles:
             cause, value, limit = Cause.IMU_FROZEN.value, float(s.frozen_for[k]), float(p.frozen_cycles)
         noise = s.noise[k]
-        of_others = (total_noise - s.recent_noise[k]) / rig.legs
+        of_others = (total_noise - (s.recent_noise[k] if s.used[k] != 0 else 0.0)) / rig.legs
         if cause == Cause.NONE and noise > max(1.0, _NOISIER * of_others):
             cause, value, limit = Cause.IMU_NOISY.value, noise, 1.0
         finite, reached = True, 0.0
@@ -180,7 +183,9 @@ def screen_imus(
         s.healthy_for[k] = s.healthy_for[k] + 1 + time.missed if healthy else 0
         s.healthy[k] = 1 if healthy and (before != 0 or s.healthy_for[k] > min(time.cycle, p.healthy_cycles)) else 0
         used = s.used[k]
-        s.used[k] = s.healthy[k] if s.excluded[k] == 0 else 0
+        # A filter would begin with a force that is not gravity.
+        waits = used == 0 and s.shaking.told != 0
+        s.used[k] = s.healthy[k] if s.excluded[k] == 0 and not waits else 0
         if not healthy and (used != 0 or time.cycle == 0):
             report_event(events, cause, k, value, limit)
         elif s.used[k] > used and time.cycle > 0:

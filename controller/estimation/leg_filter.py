@@ -77,10 +77,10 @@ def leg_parameters(fusion: FusionSettings, rate: float) -> Record:
 
 @shared_kernel
 def step_leg_filters(p: Record, s: Record, rig: Record, time: Record, imus: Record) -> None:
-    """Step the filters of the legs whose IMUs are used; none starts while they are shaken, as the force is not gravity then."""
+    """Step the filters of the legs whose IMUs are used."""
     period = elapsed(rig, time)
     for k in range(LEGS):
-        if not runs(imus, k, s.age[k]):
+        if imus.used[k] == 0:
             continue
         x, covariance, up = s.x[k], s.covariance[k], rig.sensors.up_in_joint[k]
         rate, force = imus.sample[GYROSCOPE, k], imus.sample[ACCELEROMETER, k]
@@ -106,12 +106,6 @@ def step_leg_filters(p: Record, s: Record, rig: Record, time: Record, imus: Reco
 
 
 @kernel
-def runs(imus: Record, k: int, age: int) -> bool:
-    """Whether the filter of IMU `k`, which has run for `age` cycles, takes the sample of this cycle."""
-    return bool(imus.used[k] != 0 and (age > 0 or imus.shaking.told == 0))
-
-
-@kernel
 def force_doubt(covariance: Array, d: Array, gravity: float) -> float:
     """The mean square [m^2/s^4] by which an expected force is off, as angles and angular accelerations are uncertain."""
     angles, accelerations = covariance[0, 0] + covariance[1, 1], covariance[4, 4] + covariance[5, 5]
@@ -125,7 +119,7 @@ def update_leg_directions(p: Record, s: Record, rig: Record, time: Record, imus:
     Filters that start with the first cycle need not settle.
     """
     for k in range(LEGS):
-        s.age[k] = s.age[k] + 1 + time.missed if runs(imus, k, s.age[k]) else 0
+        s.age[k] = s.age[k] + 1 + time.missed if imus.used[k] != 0 else 0
         settled = s.age[k] > min(time.cycle, p.settling_cycles)
         s.used[k] = 1.0 if settled else 0.0
         s.weights[k] = p.weight if settled else 0.0

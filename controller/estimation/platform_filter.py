@@ -138,16 +138,12 @@ def step_platform_filter(p: Record, s: Record, rig: Record, time: Record, imus: 
 
 @kernel
 def begin_platform_step(p: Record, s: Record, rig: Record, time: Record, imus: Record, pose: Record) -> bool:
-    """Start the filter where that is due, and find the acceleration of the IMU, in {2}; returns whether there is a sample.
-
-    It does not start while the IMUs are shaken, as the force is not gravity then.
-    """
+    """Start the filter where that is due, and find the acceleration of the IMU, in {2}; returns whether there is a sample."""
     age = s.age
-    runs = imus.used[PLATFORM_IMU] != 0 and (age > 0 or imus.shaking.told == 0)
-    s.age = age + 1 + time.missed if runs else 0
+    s.age = age + 1 + time.missed if imus.used[PLATFORM_IMU] != 0 else 0
     s.used = s.age > min(time.cycle, p.settling_cycles)
     s.weight = p.weight if s.used != 0 else 0.0
-    if not runs:
+    if imus.used[PLATFORM_IMU] == 0:
         return False
     force = imus.sample[ACCELEROMETER, PLATFORM_IMU]
     if age == 0:

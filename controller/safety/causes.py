@@ -217,11 +217,11 @@ class Cause(IntEnum):
     TWO_FORCES = 74, "two IMUs or more read a force that is no motion", Reaction.QUICK_STOP, "m/s^2"
     MOVES_AT_REST = (
         83,
-        "commands and gyroscopes show a motion at rest, and the estimate does not: accelerometers share an error",
+        "commands and gyroscopes show a motion at rest, and the estimate does not: IMUs may share an error",
         Reaction.QUICK_STOP,
         "m RMS of the legs",
     )
-    DRIFTS = 84, "the pose drifts from the one that gravity shows: gyroscopes share an error", Reaction.QUICK_STOP, "sigma"
+    DRIFTS = 84, "the pose drifts from the one that gravity shows: IMUs may share an error", Reaction.QUICK_STOP, "sigma"
     BASE_SWING = 75, "the base joint of leg {} would swing too far for the target", Reaction.STOP, "rad"
     PLATFORM_SWING = 76, "the platform joint of leg {} would swing too far for the target", Reaction.STOP, "rad"
     TOO_CLOSE = 77, "the target would bring leg {} too close to another leg or a plate", Reaction.STOP, "m"

@@ -73,10 +73,12 @@ _OSCILLATING_S = 1.0
 _BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0
 """How long there may be no reading of the base's IMU, and how long the first one may take [s]."""
 
-_DRIFT, _DRIFTING_S, _FIRST_DRIFT_S, _CALM_S = 3.0, 1.0, 10.0, 10.0
-"""How far the pose may drift from what gravity shows [standard deviations of the closed form], and for how long [s]. It is not
-looked at in the first seconds of the motion, in which the filters learn, nor for some seconds after the IMUs
-were shaken, as the filters have learned from that.
+_DRIFT, _DRIFTING_S = 3.0, 1.0
+"""How far the pose may drift from what gravity shows [standard deviations of the closed form], and for how long [s]."""
+
+_FIRST_DRIFT_S, _LEARNING_S = 10.0, 10.0
+"""That is not looked at in the first seconds of a motion, nor for some seconds after the IMUs were shaken or others came into
+use: the filters, and the reference of the drift, learn then.
 """
 
 PARAMETERS = record_dtype(
@@ -107,7 +109,8 @@ STATE = record_dtype(
     contradicted_for=np.float64,  # how long the IMUs have contradicted each other [s]
     unjudged=np.int64,  # whether there has been no evidence for too long
     unfit_for=np.float64,  # how long no pose has fitted the IMUs [s]
-    drifting_for=np.float64,  # how long the pose has been too far from what gravity shows; below 0: IMUs were shaken [s]
+    used_imus=np.int64,  # set of the IMUs in use, a bit for each
+    drifting_for=np.float64,  # how long the pose has been too far from what gravity shows; below 0: not looked at [s]
     without_platform_imu=np.float64,  # for how long the platform's IMU, where there is one, has been left out [s]
     off_reference_for=(np.float64, LEGS),  # how long each leg has been off its reference [s]
     deviating_for=(np.float64, LEGS),  # how long each drive has been off its command [s]
@@ -336,10 +339,9 @@ def check_rest(p: Record, s: Record, rig: Record, time: Record, both: float, ref
 
 @kernel
 def check_drift(
-    p: Record, s: Record, rig: Record, time: Record, shaking: Record, integrity: Record, reference: Record, pid: Record
+    p: Record, s: Record, rig: Record, time: Record, imus: Record, integrity: Record, reference: Record, pid: Record
 ) -> None:
-    """Without encoders: stop when the pose has drifted from the one that gravity shows, as `gravity` has it: gyroscopes share
-    an error.
+    """Without encoders: stop when the pose has drifted from the one that gravity shows, as `gravity` has it.
 
     While IMUs are shaken, accelerometers do not show gravity. If `evidence` has no limit, nothing happens.
     """
@@ -347,11 +349,15 @@ def check_drift(
     for part in range(2):
         if closed[part] > 0.0:
             furthest = max(furthest, drift[part] / np.sqrt(closed[part]))
-    w, lasts = s.watch, furthest > _DRIFT and integrity.gravity.age > _FIRST_DRIFT_S
-    if shaking.told != 0 or shaking.bridging != 0:
-        w.drifting_for = -_CALM_S
+    w, used = s.watch, 0
+    for k in range(IMU_COUNT):
+        used += imus.used[k] << k
+    lasts = furthest > _DRIFT and integrity.gravity.age > _FIRST_DRIFT_S and integrity.waits == 0
+    if imus.shaking.told != 0 or imus.shaking.bridging != 0 or used != w.used_imus:
+        w.drifting_for = -_LEARNING_S
     else:
         w.drifting_for = w.drifting_for + elapsed(rig, time) if lasts or w.drifting_for < 0.0 else 0.0
+    w.used_imus = used
     if w.drifting_for > _DRIFTING_S and s.mode == Mode.RUNNING and np.isfinite(p.watch.evidence):
         handle_cause(p, s, rig, time, reference, pid, Cause.DRIFTS, -1, furthest, _DRIFT)
 

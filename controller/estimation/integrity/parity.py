@@ -163,7 +163,7 @@ def _find_worst(s: Record, f: Record, excluded: Array, left_out: int, unknowns: 
         return -1, 0.0
     solve_cholesky(normal, fit)
     invert_cholesky(normal, covariance)
-    worst, most = 0, 0.0
+    worst, most = -1, 0.0
     for k in range(IMU_COUNT):
         if _counts(f, excluded, k) and k != left_out:
             squared = _squared_error(s, f, k, unknowns)

@@ -55,8 +55,8 @@ _SURELY = 7.0
 _BENDING_S = 4.0
 """How long a fault takes to move the pose [s]."""
 
-_UNSETTLED = 0.25
-"""How much more the pose's standard deviations count at first, fading over `_BENDING_S`: the filters still settle."""
+_UNSETTLED, _SETTLED_S = 0.25, 4.0
+"""How much more the pose's standard deviations count at first, as the filters still settle, and until when [s]."""
 
 _LASTING, _GROWN = 2.0, 6.0
 """How many times the mean error within the fault filter's memory counts, and how many times more the part of it that is not
@@ -209,7 +209,7 @@ def end_level(s: Record, e: Record, age: float) -> None:
         if not np.isfinite(closed):
             closed = own
         squared = _OF_CLOSED_FORM[part] ** 2 * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
-        squared *= (1.0 + _UNSETTLED * (1.0 - bent)) ** 2
+        squared *= (1.0 + _UNSETTLED * max(0.0, 1.0 - age / _SETTLED_S)) ** 2
         squared += (bent * s.fault[part]) ** 2
         s.closed[part] = closed if np.isfinite(closed) else 0.0
         s.evaluated[part] = squared if s.determined != 0 else np.inf

@@ -5,17 +5,19 @@ another height, and what the gyroscopes read then is learned as a constant error
 moves the platform. But it has to command that motion, and the gyroscopes see it.
 
 The rate of each leg is known twice: by its command c, less the load's share, and by the gyroscopes g, with the twist that fits
-them all, as `parity` has it. Means of both from 1 to 2.5 s after the begin of a rest are those of legs that stand still.
+them all, as `parity` has it. Means from 1 to 2.5 s after the begin of a rest are those of legs that stand still.
 
-**The creep.** The commands beyond that mean are added up. What counts is the farthest that this sum has moved the platform. The
-protection level grows with it. When the platform moves again, both fade.
+**The creep.** The commands beyond their mean are added up. What counts is the farthest that this sum has moved the platform.
+The protection level grows with it. When the platform moves again, both fade.
 
-**A motion at rest.** Both rates, less these means, are added up over some seconds:
+**A motion at rest.** Both rates, less their means, are added up over some seconds, of n legs:
 
-    m_c <- m_c + T (c - mean c - m_c / tau),   m_g <- m_g + T (g - mean g - m_g / tau),   both = m_c . m_g / max(|m_c|, |m_g|)
+    m_c <- m_c + T (c - mean c - m_c / tau),   m_g <- m_g + T (g - mean g - m_g / tau)
+    both = m_c . m_g / max(|m_c|, |m_g|) / sqrt n
 
 The mean of g goes on to be learned slowly, as gyroscopes get warm. A load that changes is in m_c alone, gyroscopes that drift
-are in m_g alone. What is in both is a motion of the platform that its estimate does not show.
+are in m_g alone. What is in both is a motion of the platform that its estimate does not show. When the pose comes from other
+IMUs or another filter, the loop corrects it, and both means are taken anew.
 """
 
 import numpy as np
@@ -47,9 +49,12 @@ _TWIST = 6
 
 STATE = record_dtype(
     rest=np.float64,  # how long the reference has been at rest [s]
-    still=(np.float64, (_WAYS, LEGS)),  # rate of each leg, by commands and by gyroscopes, when it stands still [m/s]
+    still=(np.float64, LEGS),  # commanded rate of each leg when it stands still [m/s]
     creep=(np.float64, LEGS),  # what was commanded at rest beyond that [m]
     crept=(np.float64, 2),  # by how much it has moved position [m] and rotation [rad] at most
+    source=np.int64,  # what the pose comes from
+    known=np.float64,  # how long it has come from that at rest [s]
+    mean=(np.float64, (_WAYS, LEGS)),  # rate of each leg, by commands and by gyroscopes, when it stands still [m/s]
     moved=(np.float64, (_WAYS, LEGS)),  # the sums of a motion at rest [m]
     both=np.float64,  # what is in both, RMS of the legs [m]
     jacobian=(np.float64, (6, 6)),  # from here on scratch
@@ -63,7 +68,7 @@ STATE = record_dtype(
 @kernel
 def compare_at_rest(
     s: Record, rig: Record, duration: float, follows: bool, measured: bool, commanded: Array, droop: float, drive: Array,
-    twist: Array, pose: Record, reference: Record,
+    twist: Array, source: int, pose: Record, reference: Record,
 ) -> None:  # fmt: skip
     """After the commands of a cycle: add up what they and the gyroscopes say of a motion at rest.
 
@@ -75,24 +80,21 @@ def compare_at_rest(
         commanded: (6,), rate of each leg as it was commanded, after the lag [m/s].
         droop, drive: droop [m/s/N] and load of each leg (6,) [N]: their product is the load's share.
         twist: (6,), of the platform beyond the planned one, that fits all gyroscopes [m/s, rad/s].
+        source: a number for what the pose comes from: IMUs and filter.
     """
-    if not follows:
-        s.rest = 0.0
-        s.creep[:] = 0.0
-        s.crept[:] = 0.0
-        forget_motion(s)
-        return
-    still = not measured
+    still = follows and not measured
     for k in range(rig.legs):
         still = still and abs(reference.motion[k, 1]) < _REST_MPS
+    if source != s.source or not still:
+        s.source = source
+        forget_motion(s)
     if not still:
         s.rest = 0.0
-        left = max(0.0, 1.0 - duration / _FADING_S)
+        left = max(0.0, 1.0 - duration / _FADING_S) if follows else 0.0
         for k in range(rig.legs):
             s.creep[k] *= left
         for part in range(2):
             s.crept[part] *= left
-        forget_motion(s)
         return
     jacobian_at(pose.arms, pose.directions, rig.legs, s.jacobian)
     for k in range(rig.legs):
@@ -100,35 +102,34 @@ def compare_at_rest(
         s.rates[_GYROSCOPES, k] = 0.0
         for i in range(_TWIST):
             s.rates[_GYROSCOPES, k] += s.jacobian[k, i] * twist[i]
-    before, s.rest = s.rest, s.rest + duration
-    if before >= _TO_S:
-        _add_motion(s, rig, duration)
-        _add_creep(s, rig, duration)
-        return
-    share = duration / (s.rest - _FROM_S) if before >= _FROM_S else 1.0
-    for way in range(_WAYS):
-        for k in range(rig.legs):
-            s.still[way, k] += share * (s.rates[way, k] - s.still[way, k])
+    _add_motion(s, rig, duration)
+    _add_creep(s, rig, duration)
 
 
 @kernel
 def forget_motion(s: Record) -> None:
-    """Forget the sums of a motion at rest, as the loop moves the platform, or is about to correct its pose."""
+    """Forget what is known of a motion at rest, as the loop moves the platform, or is about to correct its pose."""
+    s.known = 0.0
     s.moved[:] = 0.0
     s.both = 0.0
 
 
 @kernel
 def _add_motion(s: Record, rig: Record, duration: float) -> None:
+    before, s.known = s.known, s.known + duration
+    if before < _TO_S:
+        for way in range(_WAYS):
+            _learn_mean(s.mean[way], s.rates[way], rig.legs, before, duration)
+        return
     both = size = 0.0
     for way in range(_WAYS):
         squared = 0.0
         for k in range(rig.legs):
-            beyond = s.rates[way, k] - s.still[way, k]
+            beyond = s.rates[way, k] - s.mean[way, k]
             s.moved[way, k] += duration * (beyond - s.moved[way, k] / _ADDED_S)
             squared += s.moved[way, k] ** 2
             if way == _GYROSCOPES:
-                s.still[way, k] += duration / _WARMING_S * beyond
+                s.mean[way, k] += duration / _WARMING_S * beyond
         size = max(size, np.sqrt(squared))
     for k in range(rig.legs):
         both += s.moved[_COMMANDS, k] * s.moved[_GYROSCOPES, k]
@@ -137,13 +138,27 @@ def _add_motion(s: Record, rig: Record, duration: float) -> None:
 
 @kernel
 def _add_creep(s: Record, rig: Record, duration: float) -> None:
+    before, s.rest = s.rest, s.rest + duration
+    if before < _TO_S:
+        _learn_mean(s.still, s.rates[_COMMANDS], rig.legs, before, duration)
+        return
     for k in range(rig.legs):
-        s.creep[k] += duration * (s.rates[_COMMANDS, k] - s.still[_COMMANDS, k])
+        s.creep[k] += duration * (s.rates[_COMMANDS, k] - s.still[k])
     move_platform(s, s.creep, s.now)
     for part in range(2):
         # Where the legs do not determine the pose, `now` is infinite, and this must not stay so.
         if s.now[part] < np.inf:
             s.crept[part] = max(s.crept[part], s.now[part])
+
+
+@kernel
+def _learn_mean(mean: Array, rates: Array, legs: int, before: float, duration: float) -> None:
+    """Take rates (6,) into the mean (6,) of those from `_FROM_S` to `_TO_S`; `before` is the time so far [s]."""
+    for k in range(legs):
+        if before < _FROM_S:
+            mean[k] = rates[k]
+        else:
+            mean[k] += duration / (before + duration - _FROM_S) * (rates[k] - mean[k])
 
 
 @kernel

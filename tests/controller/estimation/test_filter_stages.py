@@ -233,27 +233,6 @@ def test_a_filter_that_starts_again_is_used_when_it_has_settled_missed_periods_c
         assert in_use() == ([1.0, float(age > SETTLING)] + [1.0] * 4, age > SETTLING, age > SETTLING)
 
 
-def test_no_filter_starts_while_the_imus_are_shaken():
-    """The force is not gravity then. Those that run go on."""
-    parameters, state = stages(load_in_space("hexapod"))
-    for _ in range(100):
-        step(parameters, state)
-    legs, platform, shaking = state["legs"], state["platform"], state["imus"]["shaking"]
-    state["imus"]["used"][[1, PLATFORM_IMU]] = 0
-    step(parameters, state)
-    state["imus"]["used"] = 1
-    shaking["told"] = 1
-    for _ in range(200):
-        step(parameters, state)
-        assert legs["used"].tolist() == [1.0, 0.0, 1.0, 1.0, 1.0, 1.0] and not platform["used"]
-    assert (legs["age"][1], platform["age"]) == (0, 0) and legs["age"][0] > 300
-    shaking["told"] = 0
-    for age in range(1, SETTLING + 2):
-        step(parameters, state)
-        assert (legs["age"][1], platform["age"]) == (age, age)
-    assert legs["used"][1] and platform["used"]
-
-
 def test_a_planar_leg_knows_no_second_angle():
     rig = load_in_space("planar-3rpr")
     parameters, state = stages(rig, magnetometer=False)

@@ -735,6 +735,8 @@ def test_a_motion_at_rest_ends_a_run_that_is_judged(both, mode, evidence, stops)
         (2.9, "", False),
         (3.1, "told", False),
         (3.1, "bridging", False),
+        (3.1, "waits", False),
+        (3.1, "set", False),
         (3.1, "age", False),
         (3.1, "evidence", False),
     ],
@@ -744,29 +746,35 @@ def test_a_pose_that_drifts_from_what_gravity_shows_for_a_second_ends_a_run(part
     p, s, integrity = parameters, state, state["integrity"]
     integrity["protection"]["closed"] = [1e-6, 4e-6]
     integrity["gravity"]["drifted"][part] = sigmas * (1e-3, 2e-3)[part]
-    integrity["gravity"]["age"] = 2.9 if change == "age" else 3.1
+    integrity["gravity"]["age"] = 9.9 if change == "age" else 10.1
     p["safety"]["watch"]["evidence"] = np.inf if change == "evidence" else 6.0
     if change in ("told", "bridging"):
         state["imus"]["shaking"][change] = 1
+    if change == "waits":
+        integrity["waits"] = 1
+    used = state["imus"]["used"]
+    s["safety"]["watch"]["used_imus"] = np.sum(used << np.arange(7))
 
     def cycles(seconds):
         for _ in range(round(seconds / PERIOD_S)):
             check_drift(
-                p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], s["imus"]["shaking"][()], integrity[()],
+                p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], s["imus"][()], integrity[()],
                 s["reference"][()], s["pid"][()],
             )  # fmt: skip
 
     cycles(0.99)
     assert state["safety"]["stop"]["cause"] == Cause.NONE
+    used[2] = 0 if change == "set" else used[2]
     cycles(0.02)
     if stops:
         assert stop_of(state) == (Cause.DRIFTS, -1, pytest.approx(sigmas), 3.0)
         return
     assert state["safety"]["stop"]["cause"] == Cause.NONE
-    if change in ("told", "bridging"):
-        # The filters need some seconds to forget what has shaken them.
-        state["imus"]["shaking"][change] = 0
-        cycles(10.99)
+    if change in ("told", "bridging", "set"):
+        # The filters need some seconds to forget what has shaken them, and the reference of the drift to follow other IMUs.
+        if change != "set":
+            state["imus"]["shaking"][change] = 0
+        cycles(10.99 if change != "set" else 10.97)
         assert state["safety"]["stop"]["cause"] == Cause.NONE
         cycles(0.02)
         assert stop_of(state)[0] == Cause.DRIFTS

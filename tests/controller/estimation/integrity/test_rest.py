@@ -28,14 +28,14 @@ class Resting:
         self.mechanism, self.parameters, self.state = moving(mechanism)
         self.loads = np.zeros(6)
 
-    def run(self, seconds, commands=0.0, twist=0.0, follows=True, measured=False):
+    def run(self, seconds, commands=0.0, twist=0.0, follows=True, measured=False, source=0):
         """Cycles with these commands of all legs [m/s] and this twist that the gyroscopes show."""
         s = self.state
         commanded, twist = np.broadcast_to(commands, 6).astype(float), np.broadcast_to(twist, 6).astype(float)
         for _ in range(round(seconds / PERIOD_S)):
             compare_at_rest(
                 self.rest[()], self.parameters["rig"][()], PERIOD_S, follows, measured, commanded, DROOP, self.loads, twist,
-                s["pose"][()], s["reference"][()],
+                source, s["pose"][()], s["reference"][()],
             )  # fmt: skip
 
     @property
@@ -151,6 +151,24 @@ def test_a_load_that_changes_gyroscopes_that_drift_and_both_against_each_other_a
     loop.run(2.6)
     loop.run(4.0, by_commands * rates, by_gyroscopes * twist)
     assert loop.rest["moved"].max() > 5e-3 and loop.rest["both"] < 1e-9
+
+
+def test_when_the_pose_comes_from_other_imus_a_motion_is_forgotten_and_the_creep_is_not():
+    """The loop corrects the pose then: commands and gyroscopes show that motion."""
+    loop = Resting()
+    twist = np.array([0.0, 0.0, 2e-3, 0.0, 0.0, 0.0])
+    rates = loop.rates_of(twist)
+    loop.run(2.6)
+    loop.run(1.0, rates, twist)
+    crept = loop.crept
+    assert loop.rest["both"] > 1e-3
+    loop.run(0.1, 20.0 * rates, 20.0 * twist, source=1)
+    assert loop.rest["both"] == 0.0 and loop.crept[0] > crept[0] + 3e-3
+    crept = loop.crept
+    loop.run(2.4, source=1)
+    loop.run(1.0, rates, twist, source=1)
+    assert loop.rest["both"] == pytest.approx(1.6e-3, rel=0.2)
+    assert loop.crept[0] > crept[0] + 1.5e-3
 
 
 HEIGHT = "imu-offset:legs,axis=0/0.89/-0.46,size_m_per_s2={size},ramp_s={within},at=4"
