@@ -363,6 +363,48 @@ def test_an_imu_is_noisy_beyond_the_limit_and_three_times_what_the_others_are(he
     assert told(5.0, 5.0) == []
 
 
+@pytest.mark.parametrize("remembers", [True, False])
+def test_samples_that_beat_with_a_vibration_are_no_fault_of_one_imu(hexapod, remembers):
+    """Each IMU, on a clock of its own, looks quiet most of the time: without a memory, one of them would look noisy."""
+    screening, told = Screening(hexapod), []
+    if not remembers:
+        screening.parameters["imus"]["remembering"] = 0.0
+    limit = screening.parameters["imus"]["noise"][ACCELEROMETER]
+    for cycle in range(4000):
+        beats = np.maximum(np.cos(2.0 * np.pi * (0.5 * cycle / RATE_HZ + np.arange(7) / 7.0)), 0.0) ** 8
+        if cycle == 1000:
+            told.clear()
+        told += screening.step(alternating(screening, 1.5 * beats * limit * np.sqrt(6.0) / 4.0))
+    assert bool([cause for cause, *_ in told if cause == Cause.IMU_NOISY]) == (not remembers)
+
+
+def test_what_one_imu_was_shaken_by_long_ago_hides_no_noise_of_another(hexapod):
+    screening, told = Screening(hexapod), []
+    limit = screening.parameters["imus"]["noise"][ACCELEROMETER] * np.sqrt(6.0) / 4.0
+    shares = np.full(7, 1.0)
+    for cycle in range(5000):
+        shares[:] = 1.0 if cycle < 500 else 0.0
+        shares[4] = 2.0 if cycle >= 500 else 1.0
+        for cause, imu, *_ in screening.step(alternating(screening, shares * limit)):
+            told.append((cycle, cause, imu))
+    # The others fade from 1 to 2 / 3 within 5 ln 1.5 = 2.03 s.
+    ((cycle, cause, imu),) = [each for each in told if each[1] == Cause.IMU_NOISY]
+    assert imu == 4 and (cycle - 500) / RATE_HZ == pytest.approx(2.03, abs=0.1)
+
+
+def test_no_imu_is_taken_back_while_imus_are_shaken(settled):
+    """A filter would begin with a force that is not gravity."""
+    settled.leave_stale(3, STALE)
+    assert settled.used == settled.without(3)
+    for _ in range(5 * HEALTHY):
+        settled.state["imus"]["shaking"]["told"] = 1
+        assert not [cause for cause, *_ in settled.step() if cause == Cause.IMU_BACK]
+        assert settled.used == settled.without(3)
+    settled.state["imus"]["shaking"]["told"] = 0
+    assert [(cause, imu) for cause, imu, *_ in settled.step()] == [(Cause.IMU_BACK, 3)]
+    assert settled.used == list(ALL_IMUS)
+
+
 def test_a_planar_mechanism_compares_an_imu_with_three_others():
     rig = load_in_space("planar-3rpr")
     shares = np.array([1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
