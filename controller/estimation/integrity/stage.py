@@ -108,6 +108,11 @@ LIMITS: Limits = {
 _FIRST_WINDOWS = 7
 """After how many windows the first evaluation begins: it is complete before the brakes have held for 0.2 s."""
 
+_WINDOWS_ANEW = 16
+"""After how many windows the first one after a new beginning begins. The loop may correct the pose to and fro within a window,
+which the fault filter does not follow: in few windows that looks like an error of the platform's accelerometer.
+"""
+
 
 def integrity_parameters(
     fusion: FusionSettings, rate: float, prior: Array, active: bool, shared_noise: float = 1.0
@@ -166,7 +171,7 @@ def step_integrity(
         if s.waits == 0:
             fault_filter.begin_anew(s.filter)
         return
-    if s.step == 0 and not (took and s.filter.windows >= _FIRST_WINDOWS):
+    if s.step == 0 and not (took and s.filter.windows >= (_FIRST_WINDOWS if s.evaluations == 0 else _WINDOWS_ANEW)):
         return
     s.cycle += 1
     # One window is left for waiting until the next evaluation may begin.

@@ -112,6 +112,21 @@ def test_after_many_missed_periods_evidence_waits_until_the_pose_is_corrected(mi
         assert integrity["filter"]["windows"] == pytest.approx((150 - waits) / 10 + before * (waits == 0), abs=1)
 
 
+@pytest.mark.parametrize(("seed", "stall"), [(0, 702), (0, 640), (4, 680), (21, 600), (22, 760)])
+def test_after_a_stall_in_the_first_second_sound_imus_do_not_look_wrong(seed, stall):
+    """The filters still learn then, and the loop corrects to and fro: with few windows that was evidence of 9.7 sigma."""
+    with prepared_loop(replace(CONFIG, target="circle", seed=seed)) as loop:
+        loop.most_missed = 1000
+        scripted(loop, {stall: 35 * MS})
+        most = 0.0
+        for end in range(stall + 60, stall + 700, 20):
+            assert loop.run(end) == Cause.NONE
+            most = max(most, float(loop.state["integrity"]["best_evidence"]))
+        assert loop.state["safety"]["stop"]["cause"] == Cause.NONE
+        assert int(loop.state["integrity"]["evaluations"]) > stall // 100
+        assert most < 6.0**2
+
+
 def test_without_disturbance_a_clock_changes_nothing():
     with prepared_loop(CONFIG) as free, prepared_loop(CONFIG) as timed:
         free.run(1000)
