@@ -51,6 +51,7 @@ STATE = record_dtype(
     rest=rest.STATE,
     compared=np.int64,  # the last window of which the gyroscopes have been compared
     contradicts=np.int64,  # whether they contradict each other, or accelerometers show no motion, found in this cycle
+    stalled=np.int64,  # whether more than a window was missed at once since the last evaluation
     waits=np.int64,  # for how many more cycles what is read counts for the gyroscopes' parity alone
     step=np.int64,  # next of the evaluation
     cycle=np.int64,  # of the evaluation
@@ -108,9 +109,9 @@ LIMITS: Limits = {
 _FIRST_WINDOWS = 7
 """After how many windows the first evaluation begins: it is complete before the brakes have held for 0.2 s."""
 
-_WINDOWS_ANEW = 16
-"""After how many windows the first one after a new beginning begins. The loop may correct the pose to and fro within a window,
-which the fault filter does not follow: in few windows that looks like an error of the platform's accelerometer.
+_WINDOWS_AFTER_STALL = 16
+"""After how many windows it does if more than a window was missed at once. The loop then corrects the pose to and fro within a
+window, which the fault filter does not follow: in few windows that looks like an error of the platform's accelerometer.
 """
 
 
@@ -147,6 +148,8 @@ def step_integrity(
     if p.filter.active == 0:
         return
     s.unjudged_for += elapsed(rig, time)
+    if time.missed > p.filter.window:
+        s.stalled = 1
     if time.missed > 0 and not fault_filter.bridge_gap(p.filter, s.filter, time.missed):
         restart_integrity(p, s)
     took = fault_filter.step_fault_filter(p.filter, s.filter, rig.sensors, imus, pose, legs, commands)
@@ -171,7 +174,8 @@ def step_integrity(
         if s.waits == 0:
             fault_filter.begin_anew(s.filter)
         return
-    if s.step == 0 and not (took and s.filter.windows >= (_FIRST_WINDOWS if s.evaluations == 0 else _WINDOWS_ANEW)):
+    least = _WINDOWS_AFTER_STALL if s.stalled != 0 and s.evaluations > 0 else _FIRST_WINDOWS
+    if s.step == 0 and not (took and s.filter.windows >= least):
         return
     s.cycle += 1
     # One window is left for waiting until the next evaluation may begin.
@@ -180,7 +184,7 @@ def step_integrity(
         _do(p, s, rig, imus, s.step)
         s.step += 1
     if s.step == STEPS:
-        s.step = s.cycle = 0
+        s.step = s.cycle = s.stalled = 0
         s.fresh = 1
         s.unjudged_for = 0.0
         s.evaluations += 1
