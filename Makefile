@@ -5,6 +5,8 @@ BIN := .venv/bin
 OUT := out
 # One more than two processors: many tests wait.
 WORKERS ?= 3
+# Of the slow tests: 1/3, 2/3 or 3/3 for a third of them.
+PART ?= 1/1
 
 comma := ,
 
@@ -34,7 +36,7 @@ test: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "not slow and not endurance"
 
 test-all: test
-	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "slow and not endurance" --hypothesis-profile=all --durations=25
+	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "slow and not endurance" --hypothesis-profile=all --durations=25 --part $(PART)
 
 test-endurance: .venv/installed-test
 	$(BIN)/pytest -n $(WORKERS) --dist worksteal -m "endurance or hypothesis" --hypothesis-profile=all

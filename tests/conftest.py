@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from zlib import crc32
 
 import pytest
 from hypothesis import settings
@@ -28,9 +29,26 @@ signal.signal(signal.SIGQUIT, signal.SIG_DFL)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
+def _part(text: str) -> tuple[int, int]:
+    part, parts = map(int, text.split("/"))
+    if not 1 <= part <= parts:
+        raise ValueError
+    return part, parts
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--part", type=_part, metavar="K/N", default=(1, 1), help="run part K of N of the tests, by their names")
+
+
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Modules with tests that are marked `slow(seconds=...)` come first, the longest first, so that no long one begins last."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the tests of other parts. Modules with tests that are marked `slow(seconds=...)` come first, the longest first,
+    so that no long one begins last.
+    """
+    part, parts = config.getoption("part")
+    chosen = [crc32(item.nodeid.encode()) % parts == part - 1 for item in items]
+    config.hook.pytest_deselected(items=[item for item, mine in zip(items, chosen, strict=True) if not mine])
+    items[:] = [item for item, mine in zip(items, chosen, strict=True) if mine]
     longest: dict[Path, float] = {}
     for item in items:
         seconds = max((mark.kwargs.get("seconds", 0.0) for mark in item.iter_markers("slow")), default=0.0)
