@@ -40,8 +40,8 @@ _PATIENT = 1.5
 """How many times the limit evidence may reach while more of it may tell what is wrong."""
 
 _UNEXPLAINED, _UNEXPLAINED_EVALUATIONS = 1.25, 3
-"""Nor may more be left than so many times the limit, and the share above, in so many evaluations in a row: then more than
-one IMU is wrong, though none of them may be beyond the limit.
+"""Nor may more be left than the sum of so many times the limit and the share above, in so many evaluations in a row: then more
+than one IMU is wrong, though none of them may be beyond the limit.
 """
 
 _FIRST_UNEXPLAINED = 20
@@ -50,10 +50,11 @@ clocks of the IMUs' own, is left unexplained, above all at low rates.
 """
 
 _LASTING, _LASTING_EVALUATIONS = 0.6, 10
-"""Evidence against an IMU that cannot be left out may be beyond this share of the limit in fewer evaluations in a row."""
+"""Evidence against an IMU that cannot be left out ends the run beyond this share of the limit, in so many evaluations in a row.
+"""
 
 _NEARLY = 0.7
-"""Share of the evidence from which on something else explains the readings as well."""
+"""Share of the evidence from which on something else explains the readings nearly as well."""
 
 _CLEARER = 1.3
 """How much more of the residuals the named IMU must explain than any other."""
@@ -343,7 +344,8 @@ def check_drift(
 ) -> None:
     """Without encoders: stop when the pose has drifted from the one that gravity shows, as `gravity` has it.
 
-    While IMUs are shaken, accelerometers do not show gravity. If `evidence` has no limit, nothing happens.
+    While IMUs are shaken, accelerometers do not show gravity. If `evidence` has no limit, nothing happens. This also notes
+    which IMUs are used, on which the check at rest relies.
     """
     drift, closed, furthest = integrity.gravity.drifted, integrity.protection.closed, 0.0
     for part in range(2):
@@ -392,8 +394,9 @@ def judge_parity(
 def judge_evidence(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, integrity: Record, reference: Record, pid: Record
 ) -> bool:
-    """After an evaluation of the evidence for faults: leave out the IMU that it is against, if it is against no other and the
-    rest agrees; take back one that it is no longer against; else stop. Returns whether the set of IMUs has changed.
+    """After an evaluation of the evidence for faults: take back IMUs that agree again. Else leave out the IMU that the evidence
+    blames, if it clearly blames this one alone and the rest agrees; wait for more if that is not clear; else stop. Returns
+    whether the set of IMUs has changed.
 
     Below the limit, stop if three evaluations in a row leave too much unexplained, or if evidence against an IMU that cannot be
     left out lasts.

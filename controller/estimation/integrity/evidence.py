@@ -182,19 +182,17 @@ def step_evidence(p: Record, s: Record, filtered: Record, excluded: Array, step:
 
 @kernel
 def _order_imus(s: Record, excluded: Array) -> None:
-    s.apart = 0
+    at = s.apart = 0
     for k in range(IMU_COUNT):
         if excluded[k] == 0:
             s.apart_system[k] = 0.0
+        else:
+            s.apart += 1
     for left_out in (1, 0):
         for k in range(IMU_COUNT):
             if (excluded[k] != 0) == (left_out == 1):
-                at = s.apart
                 s.order[at], s.place[k] = k, at
-                s.apart += 1
-    s.apart = 0
-    for k in range(IMU_COUNT):
-        s.apart += excluded[k] != 0
+                at += 1
 
 
 @kernel
@@ -395,7 +393,7 @@ def _learn(p: Record, s: Record) -> None:
 
 @kernel
 def end_blur(p: Record, s: Record, step: int) -> None:
-    """Blur what was just learned of the IMUs that it has not come to, when an evaluation is broken off before this step."""
+    """Blur what was just learned of the IMUs that an evaluation which is broken off before this step has not reached."""
     if s.windows == 0:
         for k in range(max(step - _LEARN - 1, 0) if step > _LEARN else IMU_COUNT, IMU_COUNT):
             _blur(p, s, k)

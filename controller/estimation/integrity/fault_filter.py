@@ -53,7 +53,7 @@ _UNEVEN = 0.2
 """A slower one counts if the mean place of its samples is so near the middle of the window, as a share of half of it."""
 
 _STEADY_FEEDBACK = 0.5
-"""How much feedback changes the rate of a leg without being an acceleration that was not planned [m/s^2]."""
+"""Changes of the feedback up to this count as planned: the acceleration of a leg [m/s^2]."""
 
 _TIMING_S = 3e-4
 """How far the times of samples may be off, as IMUs have clocks of their own [s]."""

@@ -102,10 +102,8 @@ STATE = record_dtype(
     evaluated=(np.float64, 2),  # the square of its first two terms, of the last complete evaluation
     closed=(np.float64, 2),  # square of the closed form's standard deviation then
     misfit=np.float64,  # of the closed form, averaged
-    hypothesis=(np.int64, 2),  # that gives the level; -1: none
     fault=(np.float64, 2),  # the greatest effect of a fault, of the last complete evaluation of recent readings
     next_fault=(np.float64, 2),  # of the one under way
-    next_hypothesis=(np.int64, 2),  # that has it; -1: none
     determined=np.int64,  # whether the readings determine the pose
     factor=(np.float64, (POSE, POSE)),  # Cholesky, of the pose's information
     error=(np.float64, POSE),  # of the pose without a fault
@@ -126,7 +124,6 @@ def begin_level(s: Record, e: Record) -> None:
     s.error[:] = e.pose_vector
     if s.determined != 0:
         solve_cholesky(s.factor, s.error)
-    s.next_hypothesis[:] = -1
     for part in range(2):
         squared = 0.0
         for i in range(3 * part, 3 * part + 3):
@@ -185,7 +182,6 @@ def take_hypothesis(
         fault = np.sqrt((seen + _UNSEEN) * variance) + most * min(1.0, seen / _SURELY)
         if fault > s.next_fault[part]:
             s.next_fault[part] = fault
-            s.next_hypothesis[part] = hypothesis
 
 
 @kernel
@@ -200,7 +196,6 @@ def end_level(s: Record, e: Record, age: float) -> None:
     bent = min(1.0, age / _BENDING_S)
     if e.of_learned == 0:
         s.fault[:] = s.next_fault
-        s.hypothesis[:] = s.next_hypothesis
     for part in range(2):
         closed = own = 0.0
         for i in range(3 * part, 3 * part + 3):

@@ -17,7 +17,7 @@ The protection level grows with it. When the platform moves again, both fade.
 
 The mean of g goes on to be learned slowly, as gyroscopes get warm. A load that changes is in m_c alone, gyroscopes that drift
 are in m_g alone. What is in both is a motion of the platform that its estimate does not show. When the pose comes from other
-IMUs or another filter, the loop corrects it, and both means are taken anew.
+IMUs or another filter, or many periods were missed, the loop corrects it, and both means are taken anew.
 """
 
 import numpy as np
