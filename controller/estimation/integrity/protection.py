@@ -55,8 +55,10 @@ _SURELY = 7.0
 _BENDING_S = 4.0
 """How long a fault takes to move the pose [s]."""
 
-_UNSETTLED, _SETTLED_S = 0.25, 4.0
-"""How much more the pose's standard deviations count at first, as the filters still settle, and until when [s]."""
+_UNSETTLED, _SETTLED_S = 0.35, 4.0
+"""How much more the pose's standard deviations count after the evidence has begun, as the filters still settle, or hardly any
+readings have been judged; and until when [s].
+"""
 
 _LASTING, _GROWN = 2.0, 6.0
 """How many times the mean error within the fault filter's memory counts, and how many times more the part of it that is not
@@ -185,13 +187,14 @@ def take_hypothesis(
 
 
 @kernel
-def end_level(s: Record, e: Record, age: float) -> None:
+def end_level(s: Record, e: Record, age: float, settled: float) -> None:
     """End an evaluation; the level is infinite where the readings do not determine the pose.
 
     Args:
         s: dtype `STATE`, with the covariances of the pose.
         e: dtype `evidence.STATE`. If the evaluation is about what was learned, the faults are those of the one before.
         age: for how long the loop has run [s].
+        settled: how much time of readings there has been since the evidence last began anew [s].
     """
     bent = min(1.0, age / _BENDING_S)
     if e.of_learned == 0:
@@ -204,7 +207,7 @@ def end_level(s: Record, e: Record, age: float) -> None:
         if not np.isfinite(closed):
             closed = own
         squared = _OF_CLOSED_FORM[part] ** 2 * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
-        squared *= (1.0 + _UNSETTLED * max(0.0, 1.0 - age / _SETTLED_S)) ** 2
+        squared *= (1.0 + _UNSETTLED * max(0.0, 1.0 - settled / _SETTLED_S)) ** 2
         squared += (bent * s.fault[part]) ** 2
         s.closed[part] = closed if np.isfinite(closed) else 0.0
         s.evaluated[part] = squared if s.determined != 0 else np.inf

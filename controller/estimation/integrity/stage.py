@@ -164,11 +164,6 @@ def step_integrity(
             or s.parity.shared != 0
             or s.parity.two != 0
         )
-    if s.evaluations > 0:
-        protection.publish_level(
-            s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max(), pose.bent,
-            s.commanded.moved, s.rest.crept, pose.apart, s.gravity.drifted,
-        )  # fmt: skip
     if s.waits > 0:
         s.waits -= 1
         if s.waits == 0:
@@ -200,6 +195,16 @@ def restart_integrity(p: Record, s: Record) -> None:
     evidence.end_blur(p.evidence, s.evidence, s.step)
     s.step = s.cycle = 0
     fault_filter.begin_anew(s.filter)
+
+
+@kernel
+def publish_level(s: Record, rig: Record, time: Record, imus: Record, pose: Record) -> None:
+    """Publish the level of the cycle, from the first evaluation on."""
+    if s.evaluations > 0:
+        protection.publish_level(
+            s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max(), pose.bent,
+            s.commanded.moved, s.rest.crept, pose.apart, s.gravity.drifted,
+        )  # fmt: skip
 
 
 @kernel

@@ -127,6 +127,16 @@ def test_after_a_stall_in_the_first_second_sound_imus_do_not_look_wrong(seed, st
         assert most < 6.0**2
 
 
+def test_a_level_that_is_recorded_is_one():
+    """Even in the cycle that completes the first evaluation."""
+    with prepared_loop(CONFIG) as loop:
+        assert loop.run(400) == Cause.NONE
+        levels = written(loop)["protection"]
+    known = ~np.isnan(levels)
+    assert 100 < np.argmax(known[:, 0]) < 200 and known[200:].all()
+    assert (levels[known] > 1e-4).all()
+
+
 def test_without_disturbance_a_clock_changes_nothing():
     with prepared_loop(CONFIG) as free, prepared_loop(CONFIG) as timed:
         free.run(1000)

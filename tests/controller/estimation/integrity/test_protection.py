@@ -17,13 +17,13 @@ NOT = (0.0, 0.0)
 
 def ended(
     level, age=50.0, of_learned=0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, crept=NOT, apart=NOT,
-    drifted=NOT,
+    drifted=NOT, settled=50.0,
 ):  # fmt: skip
     """The level (2,) at the end of an evaluation, with a misfit that lasts."""
     level["covariance"], level["misfit"] = own, misfit
     evidence = np.zeros((), STATE)
     evidence["of_learned"] = of_learned
-    end_level(level[()], evidence[()], age)
+    end_level(level[()], evidence[()], age, settled)
     publish_level(level[()], misfit, 0.01, steady, shaken, *(np.array(each) for each in (bent, moved, crept, apart, drifted)))
     return level["level"].copy()
 
@@ -106,15 +106,15 @@ def test_a_fault_has_had_as_much_time_as_the_loop_to_move_the_pose():
         np.testing.assert_allclose(ended(level, age), np.hypot(without, share * fault))
 
 
-@pytest.mark.parametrize(("age", "times"), [(0.0, 1.25), (2.0, 1.125), (4.0, 1.0), (50.0, 1.0)])
-def test_while_the_filters_settle_the_standard_deviations_count_more(age, times):
+@pytest.mark.parametrize(("settled", "times"), [(0.0, 1.35), (2.0, 1.175), (4.0, 1.0), (50.0, 1.0)])
+def test_while_the_filters_settle_the_standard_deviations_count_more(settled, times):
     _, state = evaluated()
     level = state["integrity"]["protection"]
     level["determined"] = 1
     level["next_fault"] = 0.0
     closed, own = traces()
     expected = np.sqrt([0.5**2, 1.4**2] * closed + [2.5**2, 1.4**2] * np.minimum(own, closed))
-    np.testing.assert_allclose(ended(level, age), times * expected)
+    np.testing.assert_allclose(ended(level, settled=settled), times * expected)
 
 
 def test_an_evaluation_that_was_not_ended_takes_nothing_away():
