@@ -55,9 +55,9 @@ _SURELY = 7.0
 _BENDING_S = 4.0
 """How long a fault takes to move the pose [s]."""
 
-_UNSETTLED, _SETTLED_S = 0.35, 4.0
-"""How much more the pose's standard deviations count after the evidence has begun, as the filters still settle, or hardly any
-readings have been judged; and until when [s].
+_UNSETTLED, _SETTLED_S = (0.25, 0.5), 4.0
+"""How much more the pose's standard deviations of position and rotation count after the evidence has begun, as the filters
+still settle, or hardly any readings have been judged; and until when [s].
 """
 
 _LASTING, _GROWN = 2.0, 6.0
@@ -207,7 +207,7 @@ def end_level(s: Record, e: Record, age: float, settled: float) -> None:
         if not np.isfinite(closed):
             closed = own
         squared = _OF_CLOSED_FORM[part] ** 2 * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
-        squared *= (1.0 + _UNSETTLED * max(0.0, 1.0 - settled / _SETTLED_S)) ** 2
+        squared *= (1.0 + _UNSETTLED[part] * max(0.0, 1.0 - settled / _SETTLED_S)) ** 2
         squared += (bent * s.fault[part]) ** 2
         s.closed[part] = closed if np.isfinite(closed) else 0.0
         s.evaluated[part] = squared if s.determined != 0 else np.inf
