@@ -110,8 +110,9 @@ _FIRST_WINDOWS = 7
 """After how many windows the first evaluation begins: it is complete before the brakes have held for 0.2 s."""
 
 _WINDOWS_AFTER_STALL = 16
-"""After how many windows it does if more than a window was missed at once. The loop then corrects the pose to and fro within a
-window, which the fault filter does not follow: in few windows that looks like an error of the platform's accelerometer.
+"""How many windows the next evaluation waits for if more than a window was missed at once. The loop then corrects the pose to
+and fro within a window, and the fault filter does not follow that: few windows look like an error of the platform's
+accelerometer.
 """
 
 
