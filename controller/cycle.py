@@ -418,9 +418,8 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         level = s.integrity.protection
         trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])
         trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance[1])
-        settled = s.integrity.filter.windows * p.integrity.filter.duration
-        end_level(level, s.integrity.evidence, time.cycle * rig.period, settled)
-    integrity.publish_level(s.integrity, rig, time, s.imus, s.pose)
+        end_level(level, s.integrity.evidence, time.cycle * rig.period)
+    integrity.publish_level(p.integrity, s.integrity, rig, time, s.imus, s.pose)
     changed = s.integrity.contradicts != 0 and watch.judge_parity(
         p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid
     )
@@ -431,7 +430,9 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         watch.check_judgement(p.safety, s.safety, rig, time, s.integrity, s.reference, s.pid)
         if not s.encoders.counts.any():
             watch.check_drift(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid)
-    if s.integrity.fresh != 0 and watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
+    # What parity has just left out is still in the evidence.
+    judged = s.integrity.fresh != 0 and not changed
+    if judged and watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
         trust.restart_filter(s.mechanism, time)
         integrity.restart_integrity(p.integrity, s.integrity)
 

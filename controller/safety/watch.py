@@ -49,7 +49,7 @@ _FIRST_UNEXPLAINED = 20
 clocks of the IMUs' own, is left unexplained, above all at low rates.
 """
 
-_LASTING, _LASTING_EVALUATIONS = 0.6, 10
+_LASTING, _LASTING_EVALUATIONS = 0.36, 6
 """Evidence against an IMU that cannot be left out ends the run beyond this share of the limit, in so many evaluations in a row.
 """
 

@@ -32,7 +32,7 @@ The level is the root of the sum of the squares of nine terms:
 9. How far the platform may have crept at rest, as `rest` has it: there the IMUs need not show a slow error.
 
 Terms 3 to 9 are renewed in every cycle; terms 6 and 9 are those of the cycle before, and term 8 changes with the fault filter's
-windows.
+windows. Term 2 counts more as soon as the evidence begins anew.
 """
 
 import numpy as np
@@ -101,7 +101,8 @@ _USUALLY_DRIFTED, _OF_DRIFTED = (0.3, 0.7), (3.0, 2.5)
 
 STATE = record_dtype(
     level=(np.float64, 2),  # of position [m] and rotation [rad]
-    evaluated=(np.float64, 2),  # the square of its first two terms, of the last complete evaluation
+    evaluated=(np.float64, 2),  # the square of its first term, of the last complete evaluation
+    spread=(np.float64, 2),  # the square of its second, when the filters have settled
     closed=(np.float64, 2),  # square of the closed form's standard deviation then
     misfit=np.float64,  # of the closed form, averaged
     fault=(np.float64, 2),  # the greatest effect of a fault, of the last complete evaluation of recent readings
@@ -187,14 +188,13 @@ def take_hypothesis(
 
 
 @kernel
-def end_level(s: Record, e: Record, age: float, settled: float) -> None:
+def end_level(s: Record, e: Record, age: float) -> None:
     """End an evaluation; the level is infinite where the readings do not determine the pose.
 
     Args:
         s: dtype `STATE`, with the covariances of the pose.
         e: dtype `evidence.STATE`. If the evaluation is about what was learned, the faults are those of the one before.
         age: for how long the loop has run [s].
-        settled: how much time of readings there has been since the evidence last began anew [s].
     """
     bent = min(1.0, age / _BENDING_S)
     if e.of_learned == 0:
@@ -206,22 +206,21 @@ def end_level(s: Record, e: Record, age: float, settled: float) -> None:
             own += s.covariance[1, i, i]
         if not np.isfinite(closed):
             closed = own
-        squared = _OF_CLOSED_FORM[part] ** 2 * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
-        squared *= (1.0 + _UNSETTLED[part] * max(0.0, 1.0 - settled / _SETTLED_S)) ** 2
-        squared += (bent * s.fault[part]) ** 2
+        s.spread[part] = _OF_CLOSED_FORM[part] ** 2 * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
         s.closed[part] = closed if np.isfinite(closed) else 0.0
-        s.evaluated[part] = squared if s.determined != 0 else np.inf
+        s.evaluated[part] = (bent * s.fault[part]) ** 2 if s.determined != 0 else np.inf
 
 
 @kernel
 def publish_level(
-    s: Record, misfit: float, duration: float, steady: float, shaken: float, bent: Array, moved: Array, crept: Array,
-    apart: Array, drifted: Array,
+    s: Record, settled: float, misfit: float, duration: float, steady: float, shaken: float, bent: Array, moved: Array,
+    crept: Array, apart: Array, drifted: Array,
 ) -> None:  # fmt: skip
     """Publish the level of a cycle, with what has come up since the last evaluation.
 
     Args:
         s: dtype `STATE`.
+        settled: how much time of readings there has been since the evidence last began anew [s].
         misfit: of the closed form now, `pose_estimator.STATE`.
         duration: since the last cycle [s].
         steady: greatest mean force that is no motion [m/s^2], `parity.STATE`.
@@ -235,8 +234,10 @@ def publish_level(
     s.misfit += min(1.0, duration / _MISFIT_S) * (misfit - s.misfit)
     beyond = _OF_MISFIT**2 * max(s.misfit - _USUAL_MISFIT, 0.0)
     force = min(max(steady - _SOUND, 0.0) + _SHAKEN * np.sqrt(shaken), _MOST)
+    unsettled = max(0.0, 1.0 - settled / _SETTLED_S)
     for part in range(2):
-        squared = s.evaluated[part] + beyond * s.closed[part] + (_BY_FORCE[part] * force) ** 2
+        squared = s.evaluated[part] + s.spread[part] * (1.0 + _UNSETTLED[part] * unsettled) ** 2
+        squared += beyond * s.closed[part] + (_BY_FORCE[part] * force) ** 2
         squared += bent[part] ** 2 + (_OF_CREPT * crept[part]) ** 2
         squared += (_OF_MOVED[part] * max(moved[part] - _USUALLY_MOVED[part], 0.0)) ** 2
         squared += (_OF_APART * max(apart[part] - _USUALLY_APART[part], 0.0)) ** 2

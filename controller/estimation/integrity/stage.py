@@ -51,7 +51,7 @@ STATE = record_dtype(
     rest=rest.STATE,
     compared=np.int64,  # the last window of which the gyroscopes have been compared
     contradicts=np.int64,  # whether they contradict each other, or accelerometers show no motion, found in this cycle
-    stalled=np.int64,  # whether more than a window was missed at once since the last evaluation
+    stalled=np.int64,  # whether more than a window was missed at once since the last evaluation began
     waits=np.int64,  # for how many more cycles what is read counts for the gyroscopes' parity alone
     step=np.int64,  # next of the evaluation
     cycle=np.int64,  # of the evaluation
@@ -171,8 +171,10 @@ def step_integrity(
             fault_filter.begin_anew(s.filter)
         return
     least = _WINDOWS_AFTER_STALL if s.stalled != 0 and s.evaluations > 0 else _FIRST_WINDOWS
-    if s.step == 0 and not (took and s.filter.windows >= least):
-        return
+    if s.step == 0:
+        if not (took and s.filter.windows >= least):
+            return
+        s.stalled = 0
     s.cycle += 1
     # One window is left for waiting until the next evaluation may begin.
     due = min(STEPS, -(-STEPS * s.cycle // (p.cycles - p.filter.window)))
@@ -180,7 +182,7 @@ def step_integrity(
         _do(p, s, rig, imus, s.step)
         s.step += 1
     if s.step == STEPS:
-        s.step = s.cycle = s.stalled = 0
+        s.step = s.cycle = 0
         s.fresh = 1
         s.unjudged_for = 0.0
         s.evaluations += 1
@@ -199,12 +201,12 @@ def restart_integrity(p: Record, s: Record) -> None:
 
 
 @kernel
-def publish_level(s: Record, rig: Record, time: Record, imus: Record, pose: Record) -> None:
+def publish_level(p: Record, s: Record, rig: Record, time: Record, imus: Record, pose: Record) -> None:
     """Publish the level of the cycle, from the first evaluation on."""
     if s.evaluations > 0:
         protection.publish_level(
-            s.protection, pose.misfit, elapsed(rig, time), s.parity.steady, imus.shaking.mean.max(), pose.bent,
-            s.commanded.moved, s.rest.crept, pose.apart, s.gravity.drifted,
+            s.protection, s.filter.windows * p.filter.duration, pose.misfit, elapsed(rig, time), s.parity.steady,
+            imus.shaking.mean.max(), pose.bent, s.commanded.moved, s.rest.crept, pose.apart, s.gravity.drifted,
         )  # fmt: skip
 
 

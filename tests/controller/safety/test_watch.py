@@ -672,17 +672,17 @@ def test_unexplained_evidence_must_come_in_evaluations_in_a_row_of_recent_readin
 
 
 @pytest.mark.parametrize(
-    ("imu", "needed", "evidence", "expected"), [(6, 1, 6.5, 10), (6, 1, 6.0, None), (6, 0, 6.5, None), (3, 1, 6.5, None)]
+    ("imu", "needed", "evidence", "expected"), [(6, 1, 4.9, 6), (6, 1, 4.7, None), (6, 0, 4.9, None), (3, 1, 4.9, None)]
 )
 def test_evidence_that_lasts_against_the_platforms_imu_ends_a_motion_below_the_limit(imu, needed, evidence, expected):
-    """The run may not go on without it unless the settings allow it; the limit is the root of 0.6 x 64."""
+    """The run may not go on without it unless the settings allow it; the limit is the root of 0.36 x 64."""
     _, parameters, state = moving()
     if not needed:
         parameters["safety"]["watch"]["without_platform_imu"] = np.inf
     weigh(state, imu, evidence, 7.0)
     assert evaluations_until_a_stop(parameters, state) == expected
     if expected:
-        assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(6.5), pytest.approx(np.sqrt(38.4)))
+        assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(4.9), pytest.approx(4.8))
 
 
 @pytest.mark.parametrize(("imu", "expected"), [(6, 1), (3, None)])

@@ -112,6 +112,53 @@ def test_after_many_missed_periods_evidence_waits_until_the_pose_is_corrected(mi
         assert integrity["filter"]["windows"] == pytest.approx((150 - waits) / 10 + before * (waits == 0), abs=1)
 
 
+def steps_until(loop, condition, cycle):
+    """Run cycle by cycle from this one until a condition of the integrity stage's state holds; returns the cycle."""
+    while not condition(loop.state["integrity"]):
+        cycle += 1
+        assert cycle < 1900
+        assert loop.run(cycle) == Cause.NONE
+    return cycle
+
+
+@pytest.mark.parametrize(("late", "windows"), [({1000: 50 * MS}, 16), ({1000 + 7 * k: 6 * MS for k in range(4)}, 7)])
+def test_evidence_that_begins_anew_waits_longer_after_a_stall_than_after_short_gaps(late, windows):
+    with prepared_loop(CONFIG) as loop:
+        loop.most_missed = 1000
+        scripted(loop, late)
+        at = steps_until(loop, lambda s: s["waits"] > 0, 990)
+        at = steps_until(loop, lambda s: s["waits"] == 0 and s["filter"]["windows"] == 1, at)
+        steps_until(loop, lambda s: s["step"] > 0, at)
+        assert loop.state["integrity"]["filter"]["windows"] == windows
+        assert loop.state["integrity"]["stalled"] == 0
+
+
+def test_a_stall_during_an_evaluation_is_not_forgotten_when_that_ends():
+    """A stall of two windows is bridged, and the evaluation goes on. The next new beginning still has to wait."""
+    with prepared_loop(CONFIG) as loop:
+        loop.most_missed = 1000
+        scripted(loop)
+        at = steps_until(loop, lambda s: s["evaluations"] > 5 and s["step"] == 0, 990)
+        at = steps_until(loop, lambda s: s["step"] > 0, at)
+        loop.script[at + 1, 0] = 20 * MS
+        at = steps_until(loop, lambda s: s["stalled"] == 1, at)
+        assert loop.state["integrity"]["waits"] == 0 and loop.state["integrity"]["step"] > 0
+        at = steps_until(loop, lambda s: s["fresh"] == 1, at)
+        assert loop.state["integrity"]["stalled"] == 1
+        steps_until(loop, lambda s: s["step"] > 0, at)
+        assert loop.state["integrity"]["stalled"] == 0
+
+
+def test_the_level_rises_as_soon_as_the_evidence_begins_anew():
+    with prepared_loop(CONFIG) as loop:
+        loop.most_missed = 1000
+        assert scripted(loop, {1500: 50 * MS}).run(1600) == Cause.NONE
+        records = written(loop)
+    after = int(np.argmax(records["missed"] > 0))
+    before, then = records["protection"][after - 1], records["protection"][after]
+    assert (then > 1.05 * before).all() and (then < 2.0 * before).all()
+
+
 @pytest.mark.parametrize(("seed", "stall"), [(0, 702), (0, 640), (4, 680), (21, 600), (22, 760)])
 def test_after_a_stall_in_the_first_second_sound_imus_do_not_look_wrong(seed, stall):
     """The filters still learn then, and the loop corrects to and fro: with few windows that was evidence of 9.7 sigma."""

@@ -23,8 +23,9 @@ def ended(
     level["covariance"], level["misfit"] = own, misfit
     evidence = np.zeros((), STATE)
     evidence["of_learned"] = of_learned
-    end_level(level[()], evidence[()], age, settled)
-    publish_level(level[()], misfit, 0.01, steady, shaken, *(np.array(each) for each in (bent, moved, crept, apart, drifted)))
+    end_level(level[()], evidence[()], age)
+    moves = (np.array(each) for each in (bent, moved, crept, apart, drifted))
+    publish_level(level[()], settled, misfit, 0.01, steady, shaken, *moves)
     return level["level"].copy()
 
 
@@ -178,7 +179,7 @@ def test_measurements_that_contradict_each_other_raise_the_level_between_evaluat
     np.testing.assert_allclose(ended(level, misfit=2.3), np.sqrt(calm**2 + 1.6**2 * 2.0 * closed))
     # A misfit that has just come up counts by its share of the average.
     level["misfit"] = 0.3
-    publish_level(level[()], 2.3, 0.01, 0.0, 0.0, *np.zeros((5, 2)))
+    publish_level(level[()], 50.0, 2.3, 0.01, 0.0, 0.0, *np.zeros((5, 2)))
     np.testing.assert_allclose(level["level"], np.sqrt(calm**2 + 1.6**2 * 0.2 * closed))
     assert np.isinf(ended(level, own=np.full_like(OWN, np.inf), misfit=2.3)).all()
 
