@@ -44,13 +44,13 @@ _UNEXPLAINED, _UNEXPLAINED_EVALUATIONS = 1.25, 3
 than one IMU is wrong, though none of them may be beyond the limit.
 """
 
-_FIRST_UNEXPLAINED = 20
-"""From which evaluation on that counts: until then nothing has been learned, and what a calibration does not know, such as
-clocks of the IMUs' own, is left unexplained, above all at low rates.
-"""
-
 _LASTING, _LASTING_EVALUATIONS = 0.36, 6
 """Evidence against an IMU that cannot be left out ends the run beyond this share of the limit, in so many evaluations in a row.
+"""
+
+_FIRST_COUNTED = 20
+"""From which evaluation on both count: until then nothing has been learned, and what a calibration does not know, such as
+clocks of the IMUs' own, is left unexplained, above all at low rates.
 """
 
 _NEARLY = 0.7
@@ -126,6 +126,7 @@ STATE = record_dtype(
     cleared_for=(np.int64, IMU_COUNT),  # in how many evaluations there has been little evidence against an IMU left out
     unexplained_for=np.int64,  # in how many more than one IMU has been wrong
     lasting_for=np.int64,  # in how many there has been evidence against an IMU that is needed
+    lasting=(np.float64, 2),  # what has lasted long enough to end a run, and its limit; 0 if nothing has
 )
 """What the rig has reported, and what lasts."""
 
@@ -382,6 +383,7 @@ def judge_parity(
         return False
     if parity.named != 0 and _may_leave_out(p.watch, imus, parity.worst):
         imus.excluded[parity.worst] = 1
+        _count_anew(s.watch)
         report_event(s.events, Cause.GYROSCOPE_OFF, parity.worst, parity.error, parity.limit)
         return True
     handle_cause(
@@ -394,9 +396,9 @@ def judge_parity(
 def judge_evidence(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, integrity: Record, reference: Record, pid: Record
 ) -> bool:
-    """After an evaluation of the evidence for faults: take back IMUs that agree again. Else leave out the IMU that the evidence
-    blames, if it clearly blames this one alone and the rest agrees; wait for more if that is not clear; else stop. Returns
-    whether the set of IMUs has changed.
+    """After an evaluation of the evidence for faults of the present set of IMUs: take back IMUs that agree again. Else leave
+    out the IMU that the evidence blames, if it clearly blames this one alone and the rest agrees; wait for more if that is not
+    clear; else stop. Returns whether the set of IMUs has changed.
 
     Below the limit, stop if three evaluations in a row leave too much unexplained, or if evidence against an IMU that cannot be
     left out lasts.
@@ -414,18 +416,18 @@ def judge_evidence(
             w.returns[k] += 1
             back = True
     rest, usual_rest = e.all_evidence - e.imu_evidence, _REST_OF_ALL * e.imu_evidence
-    if judged:
-        _count_evaluations(p.watch, w, e, rest - usual_rest)
+    if back:
+        _count_anew(w)
+    elif judged:
+        _count_evaluations(p.watch, w, e, rest, usual_rest)
     if back or not _moves(s):
         return back
     k, most = e.blamed, np.sqrt(limit)
     if not e.best_evidence >= limit:
-        if judged and w.unexplained_for >= _UNEXPLAINED_EVALUATIONS:
-            least = np.sqrt(_UNEXPLAINED * limit + usual_rest)
-            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(rest), least)
-        elif judged and w.lasting_for >= _LASTING_EVALUATIONS:
-            least = np.sqrt(_LASTING * limit)
-            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), least)
+        if judged and w.lasting[1] > 0.0:
+            found, least = np.sqrt(w.lasting)
+            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, found, least)
+            _report_rival(s, e, least)
         return False
     if k < 0:
         cause = Cause.GYROSCOPES_SHARE + e.shared
@@ -437,7 +439,7 @@ def judge_evidence(
     alone = clear and rest_agrees and e.evidence.of_learned == 0
     if alone and _may_leave_out(p.watch, imus, k):
         imus.excluded[k] = 1
-        w.unexplained_for = 0
+        _count_anew(w)
         report_event(s.events, Cause.IMU_CONTRADICTED, k, np.sqrt(e.imu_evidence), most)
         return True
     # Nothing is gained by waiting where the IMU cannot be left out.
@@ -449,12 +451,25 @@ def judge_evidence(
 
 
 @kernel
-def _count_evaluations(p: Record, w: Record, e: Record, unexplained: float) -> None:
+def _count_evaluations(p: Record, w: Record, e: Record, rest: float, usual_rest: float) -> None:
     """Count the evaluations in a row that leave too much unexplained, and those that are against an IMU that is needed."""
-    much = e.evaluations >= _FIRST_UNEXPLAINED and unexplained >= _UNEXPLAINED * p.evidence
-    w.unexplained_for = w.unexplained_for + 1 if much else 0
-    lasts = e.best_evidence >= _LASTING * p.evidence and _is_needed(p, e.blamed)
-    w.lasting_for = w.lasting_for + 1 if lasts else 0
+    counts = e.evaluations >= _FIRST_COUNTED
+    most_rest, most = _UNEXPLAINED * p.evidence + usual_rest, _LASTING * p.evidence
+    w.unexplained_for = w.unexplained_for + 1 if counts and rest >= most_rest else 0
+    lasts = e.best_evidence >= most and _is_needed(p, e.blamed)
+    w.lasting_for = w.lasting_for + 1 if counts and lasts else 0
+    w.lasting[:] = 0.0
+    if w.unexplained_for >= _UNEXPLAINED_EVALUATIONS:
+        w.lasting[0], w.lasting[1] = rest, most_rest
+    elif w.lasting_for >= _LASTING_EVALUATIONS:
+        w.lasting[0], w.lasting[1] = e.imu_evidence, most
+
+
+@kernel
+def _count_anew(w: Record) -> None:
+    """Count no evaluation of another set of IMUs."""
+    w.unexplained_for = w.lasting_for = 0
+    w.lasting[:] = 0.0
 
 
 @kernel

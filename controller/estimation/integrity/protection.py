@@ -206,8 +206,9 @@ def end_level(s: Record, e: Record, age: float) -> None:
             own += s.covariance[1, i, i]
         if not np.isfinite(closed):
             closed = own
-        s.spread[part] = _OF_CLOSED_FORM[part] ** 2 * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
+        spread = _OF_CLOSED_FORM[part] ** 2 * closed + _OF_SOURCE[part] ** 2 * min(own, closed)
         s.closed[part] = closed if np.isfinite(closed) else 0.0
+        s.spread[part] = spread if s.determined != 0 else 0.0
         s.evaluated[part] = (bent * s.fault[part]) ** 2 if s.determined != 0 else np.inf
 
 

@@ -233,6 +233,23 @@ def test_evidence_is_told_in_the_cycle_of_its_evaluation_alone(hexapod):
     assert Cause.POSE_LOST in told and Cause.IMU_CONTRADICTED not in told
 
 
+@pytest.mark.parametrize("blamed", [-1, 6])
+def test_evidence_below_its_limit_that_lasts_prevents_arming(hexapod, blamed):
+    """It would end the run at once."""
+    bench = Bench(hexapod)
+    bench.steps(bench.hold - 1)
+    lasting = bench.state["safety"]["watch"]["lasting"]
+    lasting[:] = 25.0, 24.0
+    bench.state["integrity"]["blamed"] = blamed
+    bench.steps(2)
+    assert bench.mode == Mode.IDLE
+    cause = Cause.NO_TRUST if blamed < 0 else Cause.NO_SENSORS
+    assert obstacle(bench) == (cause, blamed, 5.0, np.sqrt(24.0))
+    lasting[:] = 0.0
+    bench.steps(2)
+    assert bench.mode == Mode.RUNNING
+
+
 @pytest.mark.parametrize("blamed", [-1, 3])
 @pytest.mark.parametrize("kind", [0, 1])
 def test_evidence_of_either_kind_prevents_arming(hexapod, kind, blamed):

@@ -680,9 +680,36 @@ def test_evidence_that_lasts_against_the_platforms_imu_ends_a_motion_below_the_l
     if not needed:
         parameters["safety"]["watch"]["without_platform_imu"] = np.inf
     weigh(state, imu, evidence, 7.0)
+    # The first two seconds do not count.
+    state["integrity"]["evaluations"] = 19
+    assert evaluations_until_a_stop(parameters, state) is None
+    state["integrity"]["evaluations"] = 20
     assert evaluations_until_a_stop(parameters, state) == expected
     if expected:
         assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(4.9), pytest.approx(4.8))
+
+
+@pytest.mark.parametrize("change", ["back", "parity"])
+def test_evidence_about_another_set_of_imus_does_not_last(change):
+    _, parameters, state = moving()
+    p, s, integrity = parameters, state, state["integrity"]
+    state["imus"]["healthy"], integrity["evaluations"] = 1, 20
+    weigh(state, 6, 4.9, 7.0)
+    assert evaluations_until_a_stop(parameters, state, 6) is None
+    if change == "back":
+        state["imus"]["excluded"][3] = 1
+        state["safety"]["watch"]["cleared_for"][3] = 5
+        evidence = integrity["evidence"]
+        evidence["apart"], evidence["order"][0], evidence["apart_evidence"][0] = 1, 3, 0.0
+        assert judge(parameters, state)
+        evidence["apart"] = 0
+    else:
+        integrity["parity"]["named"], integrity["parity"]["worst"] = 1, 3
+        assert judge_parity(
+            p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], s["imus"][()], integrity["parity"][()],
+            s["reference"][()], s["pid"][()],
+        )  # fmt: skip
+    assert evaluations_until_a_stop(parameters, state) == 6
 
 
 @pytest.mark.parametrize(("imu", "expected"), [(6, 1), (3, None)])

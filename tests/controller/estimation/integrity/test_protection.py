@@ -93,7 +93,8 @@ def test_where_the_pose_is_not_determined_there_is_no_level():
     s = state["integrity"]
     s["evidence"]["pose_information"] = 0.0
     begin_level(s["protection"][()], s["evidence"][()])
-    assert np.isinf(ended(s["protection"])).all()
+    for own in (OWN, np.full_like(OWN, np.nan)):
+        assert np.isinf(ended(s["protection"], own=own)).all()
 
 
 def test_a_fault_has_had_as_much_time_as_the_loop_to_move_the_pose():
