@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from controller.cycle import MARKS, STATE, prepare_next, skip_periods
+from controller.estimation.integrity.hypotheses import HYPOTHESES, imu_of
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.plan_handover import STREAM, TAKEN, publish_plan
 from controller.planning.stream_planner import StreamPlanner
@@ -147,6 +148,23 @@ def test_a_stall_during_an_evaluation_is_not_forgotten_when_that_ends():
         assert loop.state["integrity"]["stalled"] == 1
         steps_until(loop, lambda s: s["step"] > 0, at)
         assert loop.state["integrity"]["stalled"] == 0
+
+
+def test_evidence_from_before_parity_has_left_out_an_imu_is_not_judged():
+    """A gap of two periods lets a window end with an evaluation, in which something speaks against another IMU."""
+    with prepared_loop(CONFIG) as loop:
+        begin = steps_until(scripted(loop), lambda s: s["evaluations"] > 5 and s["step"] == 0, 990)
+        begin = steps_until(loop, lambda s: s["step"] > 0, begin)
+        at = 1e-3 * (begin + 76 - int(loop.parameters["rig"]["hold_cycles"]))
+    with prepared_loop(replace(CONFIG, faults=(f"imu-offset:2,axis=z,size_deg_per_s=20,at={at:.3f}",))) as loop:
+        scripted(loop, {begin + 8: 2 * MS})
+        assert loop.run(begin + 90) == Cause.NONE
+        integrity = loop.state["integrity"]
+        integrity["found"][np.array([imu_of(h) for h in range(HYPOTHESES)]) == 4] = 1e4
+        assert loop.run(begin + 91) == Cause.NONE
+        assert integrity["contradicts"] == 1 and integrity["fresh"] == 1 and integrity["best_evidence"] == 1e4
+        assert loop.state["safety"]["stop"]["cause"] == Cause.NONE
+        assert loop.state["imus"]["excluded"].tolist() == [0, 0, 1, 0, 0, 0, 0]
 
 
 def test_the_level_rises_as_soon_as_the_evidence_begins_anew():
