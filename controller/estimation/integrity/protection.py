@@ -55,7 +55,7 @@ _SURELY = 7.0
 _BENDING_S = 4.0
 """How long a fault takes to move the pose [s]."""
 
-_UNSETTLED, _SETTLED_S = (0.25, 0.5), 4.0
+_UNSETTLED, _SETTLED_S = (0.25, 0.6), 4.0
 """How much more the pose's standard deviations of position and rotation count after the evidence has begun, as the filters
 still settle, or hardly any readings have been judged; and until when [s].
 """
