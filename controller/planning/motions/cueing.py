@@ -218,13 +218,15 @@ class Site:
         # By which each axis moves the legs that it moves most.
         slopes = np.abs(self.lengths(small * np.eye(6)) - self.lengths(-small * np.eye(6))).max(axis=1) / (2.0 * small)
         slopes[free == 0.0] = np.inf
-        accelerations = _chosen(washout.most_acceleration, _SHARE_OF_ACCELERATION * limits.acceleration / slopes[:3])
+        usual = _SHARE_OF_ACCELERATION * limits.acceleration / slopes[:3]
+        accelerations = _chosen(washout.most_acceleration, usual)
         turn_speeds = _chosen(washout.most_turn_speed, _SHARE_OF_VELOCITY * limits.velocity / slopes[3:])
         # A step of an acceleration has the jerk v / e of it after two low-passes at v, and moves by 1 / w^2 of it; a step of an
         # angular velocity turns by 1 / (e w) of it.
         smoothing = _hertz(washout.smoothing_frequency, e * limits.jerk / limits.acceleration)
         room = np.array([self.room([axis])[axis] if free[axis] else np.inf for axis in range(6)])
-        away = _hertz(washout.washout_frequency, np.sqrt((accelerations / room[:3]).max()))
+        # The tilt has this frequency, too: where the platform may not move along any axis, it is the usual one.
+        away = _hertz(washout.washout_frequency, np.sqrt(((accelerations if accelerations.any() else usual) / room[:3]).max()))
         turn_away = _hertz(washout.turn_washout_frequency, (turn_speeds / (e * (1.0 - _TILT_SHARE) * room[3:])).max())
         tilt_frequency = _hertz(washout.tilt_frequency, away)
         leans = [3 + axis for axis in range(3) if axis != np.abs(self.up).argmax()]
@@ -245,8 +247,8 @@ def _chosen(given: Numbers | None, default: Array) -> Array:
 
 
 def _hertz(given: float | None, default: float) -> float:
-    """A frequency [rad/s], given in Hz or not."""
-    return float(default if given is None else 2.0 * np.pi * given)
+    """A frequency [rad/s], given in Hz or not; it is never so low that the filter could not divide by it."""
+    return float(max(default, 2.0 * np.pi * _LEAST_HZ) if given is None else 2.0 * np.pi * given)
 
 
 def quaternions_of(vectors: Array) -> Array:

@@ -151,6 +151,19 @@ def test_what_lasts_is_felt_as_gravity_and_the_platform_comes_back(hexapod, alon
     assert (rows["moves"][5, :2] * asked >= 0.0).all()
 
 
+def test_a_cue_that_may_not_move_or_turn_tilts_alone(hexapod):
+    """No filter divides by 0 where nothing is to be washed out, and the tilt is as quick as usual."""
+    times = np.arange(0.0, 60.0, 0.01)
+    forces, rates = np.tile([0.5, -0.2, 3.0], (len(times), 1)), np.tile([0.1, 0.2, -0.3], (len(times), 1))
+    usual, still = site_at_home(hexapod).filter(Washout()), Washout(most_acceleration=(0.0,) * 3, most_turn_speed=(0.0,) * 3)
+    rows, p = filtered(site_at_home(hexapod), still, times, forces, rates)
+    felt = Rotation.from_rotvec(rows["moves"][-1, 3:]).inv().apply(G * UP)
+    np.testing.assert_allclose(felt[:2], [0.25, -0.1], rtol=0.0, atol=1e-6)
+    assert p["washout"] == usual["washout"] and p["tilt_frequency"] == usual["tilt_frequency"]
+    assert np.isfinite(rows["moves"]).all() and (rows["moves"][:, :3] == 0.0).all()
+    assert np.abs(rows["moves"][:, 5]).max() < 1e-9
+
+
 def test_a_step_of_angular_velocity_is_washed_out(hexapod):
     times = np.arange(0.0, 20.0, 0.005)
     rates = np.tile([0.0, 0.0, 0.2], (len(times), 1))
