@@ -1,5 +1,7 @@
 """Direct kinematics from the lengths of all legs, by Newton's method on SE(3) from a first guess, for rigs with encoders."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -48,6 +50,12 @@ def poses_from_lengths(mechanism: Mechanism, lengths: ArrayLike, guess: Pose, pa
     if found < len(given) and not partial:
         raise SingularConfigurationError(f"no pose near the one before has the lengths of row {found}")
     return positions, rotations
+
+
+def kernels_of_lengths(mechanism: Mechanism) -> tuple[tuple[Any, ...], ...]:
+    """The kernel of `poses_from_lengths`, with arguments, as `load_kernels` takes it."""
+    lengths, rotation = checked_array(np.zeros((1, mechanism.legs)), (1, mechanism.legs), "lengths"), np.eye(3)
+    return ((_find_poses, geometry_of(mechanism), lengths, np.zeros(3), rotation, np.zeros((1, 3)), rotation[None].copy()),)
 
 
 def _follow(mechanism: Mechanism, lengths: Array, guess: Pose) -> tuple[Array, Array, int, float]:

@@ -8,6 +8,7 @@ the stop itself.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from ruckig import ControlInterface, InputParameter, Ruckig, Synchronization, Trajectory
@@ -20,7 +21,7 @@ from controller.planning.target import Target
 from controller.planning.trajectory_generator import calculate, phases_of
 from plant.compiled import kernel
 from plant.errors import PlanningError, UnreachableError
-from plant.mechanism import Limits, Mechanism, six_rows
+from plant.mechanism import LEGS, Limits, Mechanism, six_rows
 from plant.pose import Array
 
 PREVIEW_S = 0.03
@@ -67,6 +68,16 @@ def plan(mechanism: Mechanism, target: Target, duration: float) -> Reference:
     return Reference(six_rows(segments), count_violations(segments, horizon, limits))
 
 
+def kernels_of_plan() -> tuple[tuple[Any, ...], ...]:
+    """The kernels of `plan`, with arguments each, as `load_kernels` takes them."""
+    segments, stroke = np.zeros((LEGS, 1, 5)), np.zeros((LEGS, 2))
+    return (
+        (_stops_inside, np.zeros((3, LEGS)), stroke, np.zeros(2)),
+        (_collect_segments, np.zeros((1, LEGS, 2, _PHASES)), np.zeros((1, 3, LEGS)), np.zeros(2), segments),
+        (_count_violations, segments, 0.0, stroke, np.zeros(3)),
+    )
+
+
 def _check_reach(mechanism: Mechanism, target: Target) -> None:
     """Check a target against the strokes; if it would be inside when read in another way, the error says so."""
     try:
@@ -79,14 +90,14 @@ def _check_reach(mechanism: Mechanism, target: Target) -> None:
 def count_violations(segments: Array, horizon: float, limits: Limits) -> int:
     """How many segments before `horizon` [s] leave the stroke, or the limits of velocity, acceleration or jerk."""
     most = np.array([limits.velocity, limits.acceleration, limits.jerk])
-    return int(_count_violations(segments, horizon, limits.stroke, most))
+    return int(_count_violations(segments, horizon, limits.stroke.copy(), most))
 
 
 class _Planner:
     """Extends a reference by one sample period at a time, and keeps the state from which the next plan starts."""
 
     def __init__(self, limits: Limits, lengths: Array, preview: float | None) -> None:
-        self._limits = limits
+        self._limits, self._stroke = limits, limits.stroke.copy()
         self._legs = len(lengths)
         self._state: tuple[list[float], ...] = (lengths.tolist(), [0.0] * self._legs, [0.0] * self._legs)
         self._otg = Ruckig(self._legs, SAMPLE_PERIOD_S)
@@ -140,7 +151,7 @@ class _Planner:
         if near and not self._stays_inside():
             return False
         after = np.array(self._trajectory.at_time(SAMPLE_PERIOD_S)[:3])
-        return bool(_stops_inside(after, self._limits.stroke, self._stop_limits))
+        return bool(_stops_inside(after, self._stroke, self._stop_limits))
 
     def _stays_inside(self) -> bool:
         return all(

@@ -1,6 +1,7 @@
 """How far poses are from everything that limits them."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -135,6 +136,15 @@ def margins(
         )
         values[:, DIRECT_KINEMATICS] = found - least_conditioning(mechanism)
     return Margins(values, scales_of(space))
+
+
+def kernels_of_margins(mechanism: Mechanism) -> tuple[tuple[Any, ...], ...]:
+    """The kernels of `margins`, with arguments each, as `load_kernels` takes them; without that of the conditioning."""
+    poses = np.zeros((1, 3)), np.zeros((1, 3, 3))
+    return (
+        (margin_rows, space_of(mechanism, USUAL), np.zeros((), WORK), *poses, np.zeros((1, COUNT)), 0, 1),
+        (first_that_is_none, *poses),
+    )
 
 
 def margins_at(mechanism: Mechanism, pose: Pose, demands: Demands | None = None) -> dict[Limit, float]:

@@ -8,6 +8,7 @@ from controller.workspace.check import (
     check_against_limits,
     closest_limits,
     first_excess,
+    load_check,
     pose_text,
 )
 from controller.workspace.extent import (
@@ -47,6 +48,7 @@ __all__ = [
     "geometry_figures",
     "largest_box",
     "largest_ellipsoid",
+    "load_check",
     "margins",
     "margins_at",
     "nearest_reachable",

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from controller.direct_kinematics import poses_from_lengths
+from controller.direct_kinematics.lengths import kernels_of_lengths, poses_from_lengths
 from controller.frames import ActiveFrames, Frames
 from controller.inverse_kinematics import leg_lengths
 from controller.planning.motions.planned import Peak
-from controller.planning.offline_planner import Reference, plan
+from controller.planning.offline_planner import Reference, kernels_of_plan, plan
 from controller.planning.pace import exact_peaks, least_time_scale, target_peaks
 from controller.planning.segments import lengths_along
 from controller.planning.target import Target
@@ -30,9 +30,10 @@ from controller.pose_limits.limits import (
     least_conditioning,
     space_of,
 )
-from controller.pose_limits.margins import Margins, margins
+from controller.pose_limits.margins import Margins, kernels_of_margins, margins
 from controller.workspace.nearest import Nearest, nearest_reachable
 from plant.checks import LEAST_TIME_SCALE
+from plant.compiled import load_kernels
 from plant.errors import MissingPackageError, UnreachableError
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array, Pose, vector_from_rotation
@@ -173,6 +174,12 @@ class TargetCheck:
             "peaks": [peak.plain() for peak in self.peaks],
             "time_scale": None if self.reference is None else self.time_scale(),
         }  # fmt: skip
+
+
+def load_check(mechanism: Mechanism) -> None:
+    """Load the machine code of `check_against_limits` beforehand; what is not in the cache is compiled on all cores."""
+    lengths = lengths_along, np.zeros((mechanism.legs, 1, 5)), np.zeros(1), np.zeros((1, mechanism.legs))
+    load_kernels(*kernels_of_margins(mechanism), *kernels_of_plan(), *kernels_of_lengths(mechanism), lengths)
 
 
 def check_against_limits(mechanism: Mechanism, target: Target, duration: float, demands: Demands | None = None) -> TargetCheck:

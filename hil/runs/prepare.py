@@ -25,7 +25,7 @@ from controller.safety.arming import longest_delay
 from controller.safety.causes import Cause
 from controller.safety.stop import describe_end
 from controller.settings import control_settings, drive_settings, safety_settings, sensor_settings, tables_with
-from controller.workspace import Demands, TargetCheck, check_against_limits
+from controller.workspace import Demands, TargetCheck, check_against_limits, load_check
 from hil.loop.driver import Loop
 from hil.loop.records import RECORD
 from hil.recording.replay_rig import ReplayRig
@@ -161,6 +161,8 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
         if config.open_loop:
             parameters["pid"]["gains"] = 0.0
             watch_drives_alone(parameters)
+        if not config.streamed:
+            load_check(mechanism)
         # Loads the planner, so that the planning time is that of the plan alone.
         plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
         planning_time = 0.0

@@ -1,5 +1,8 @@
 """Targets against all limits: what is refused, when, and why; and the nearest pose that is not."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -256,3 +259,30 @@ def test_no_plan_for_a_stream_leaves_a_limit_of_the_pose(seed):
     scaled = values.min(axis=0)
     assert scaled.min() > -2e-4
     assert np.linalg.norm(np.array(follower.pieces)[-1, :, 1]) < 1e-9
+
+
+@pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
+def test_a_check_after_its_machine_code_was_loaded_compiles_none_of_it_for_other_types(name):
+    """In a process of its own: kernels that other tests have called know other types, too."""
+    code = f"""
+import pickle
+from controller.direct_kinematics import lengths
+from controller.planning import offline_planner, segments
+from controller.planning.target import load_target
+from controller.pose_limits.margins import first_that_is_none, margin_rows
+from controller.workspace import check_against_limits, load_check
+from plant.mechanism import load_in_space
+
+kernels = (
+    margin_rows, first_that_is_none, lengths._find_poses, segments.lengths_along,
+    offline_planner._stops_inside, offline_planner._collect_segments, offline_planner._count_violations,
+)
+mechanism = load_in_space({name!r})
+load_check(mechanism)
+loaded = [[*kernel.overloads] for kernel in kernels]
+assert all(len(types) == 1 for types in loaded)
+for each in (mechanism, pickle.loads(pickle.dumps(mechanism))):
+    assert check_against_limits(each, load_target("circle", each, 0.2), 0.2).passes
+assert [[*kernel.overloads] for kernel in kernels] == loaded
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
