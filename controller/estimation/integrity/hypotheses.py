@@ -14,13 +14,13 @@ from enum import IntEnum
 
 import numpy as np
 
+from controller.estimation.integrity.fault_filter import FAULTS
 from controller.estimation.whole_mechanism.readings import READINGS
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
 from plant.pose import Array
 from plant.vectors import Vector, vector
 
-FAULTS = IMU_COUNT * READINGS
 MOST_DIRECTIONS = 6
 
 

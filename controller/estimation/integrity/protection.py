@@ -37,12 +37,12 @@ windows. Term 2 counts more as soon as the evidence begins anew.
 
 import numpy as np
 
+from controller.estimation.integrity.evidence import POSE
 from controller.estimation.integrity.hypotheses import HYPOTHESES
 from controller.least_squares import factor_cholesky, solve_cholesky
 from plant.compiled import Record, kernel, record_dtype
 from plant.pose import Array
 
-POSE = 6
 _CHANCE = 1.0
 """By how much evidence may exceed the number of directions before a fault counts as seen."""
 
