@@ -63,9 +63,12 @@ def test_fmi_3_in_other_units_is_the_same_motion(foreign_fmu, foreign_fmu_3, bin
         for fmu, text in ((foreign_fmu, binding), (foreign_fmu_3, binding_3))
     )
     assert three.summary()["tracking"]["position_rms"] < 0.05 * MM
-    # Other units round otherwise, the loop feeds it back, and each start of a leg from rest makes it larger.
-    for field, tolerance in (("position", 1e-8), ("rotation", 1e-6), ("command", 1e-5), ("truth", 1e-7)):
-        np.testing.assert_allclose(three.records[field], two.records[field], rtol=0.0, atol=tolerance)
+    # Other units round otherwise, as processors do; the loop feeds it back, and each start of a leg from rest makes it larger:
+    # a hundredfold after 0.6 s.
+    for field, tolerance in (("position", 1e-9), ("rotation", 1e-7), ("command", 1e-6), ("truth", 1e-8)):
+        for end, larger in ((600, 1.0), (None, 100.0)):
+            other, one = three.records[field][:end], two.records[field][:end]
+            np.testing.assert_allclose(other, one, rtol=0.0, atol=larger * tolerance)
     assert np.ptp(three.true_positions, axis=0).max() > 5.0 * MM
 
 
