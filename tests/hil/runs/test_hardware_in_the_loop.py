@@ -140,7 +140,7 @@ def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
     wait for twice as long as at 250. Their samples come at this rate too, as the noise of a faster part is larger, and the
     gains are lower than those of the preset, which oscillate when samples are late.
 
-    On a busy machine all of them may wait at once, which ends a run as it should. Then there is another.
+    On a busy machine all of them may wait at once, which ends a run as it should. If samples were late, there is another.
     """
     patient = tmp_path / "patient.toml"
     changes = "most_lost_imus = 4\nneed_platform_imu = 0\n\n[control]\nproportional = 35.0\nintegral = 80.0\n"
@@ -154,7 +154,8 @@ def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
             status, _, errors = finished(run)
         if "ip route add" in errors:
             pytest.skip("this machine has no multicast")
-        if "no longer determine the pose" not in errors:
+        records = read(tmp_path / "can.mcap").records
+        if status == 0 or not records["sample_age"].any():
             break
     assert status == 0, errors
     figures = json.loads((tmp_path / "can.json").read_text())
@@ -162,7 +163,6 @@ def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
     assert figures["errors_m"]["known"] > 450
     assert figures["errors_m"]["estimation"] < 2e-3
     assert figures["errors_m"]["tracking"] < 1e-3
-    records = read(tmp_path / "can.mcap").records
     assert np.mean(records["imus"][records["mode"] == Mode.RUNNING] & 0x7F == 0x7F) > 0.8
     assert replay([tmp_path / "can.mcap"]).same
 
