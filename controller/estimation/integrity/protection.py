@@ -68,7 +68,7 @@ usual.
 USUAL_S = 5.0
 """Over what time of evaluations the usual error is averaged [s]; each fifth evaluation is about what was learned instead."""
 
-_OF_CLOSED_FORM, _OF_SOURCE = (1.5, 1.4), (2.1, 1.4)
+_OF_CLOSED_FORM, _OF_SOURCE = (1.5, 1.6), (2.1, 1.2)
 """How many standard deviations of position and rotation count: of the pose in closed form, and of the better known of this and
 the pose's source. Joints that are off by 0.2 mm move either pose alike, by up to two standard deviations of the closed form.
 """

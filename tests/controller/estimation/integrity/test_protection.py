@@ -55,7 +55,7 @@ def level_of(state, frames, predicted, place, usual):
             ]
         )
     closed, own = traces()
-    squared = [1.5**2, 1.4**2] * closed + [2.1**2, 1.4**2] * np.minimum(own, closed) + np.max(faults, axis=0) ** 2
+    squared = [1.5**2, 1.6**2] * closed + [2.1**2, 1.2**2] * np.minimum(own, closed) + np.max(faults, axis=0) ** 2
     return np.sqrt(squared), np.array(left)
 
 
@@ -115,7 +115,7 @@ def test_while_the_filters_settle_the_standard_deviations_count_more(settled, ti
     level["determined"] = 1
     level["next_fault"] = 0.0
     closed, own = traces()
-    expected = np.sqrt([1.5**2, 1.4**2] * closed + [2.1**2, 1.4**2] * np.minimum(own, closed))
+    expected = np.sqrt([1.5**2, 1.6**2] * closed + [2.1**2, 1.2**2] * np.minimum(own, closed))
     np.testing.assert_allclose(ended(level, settled=settled), np.multiply(times, expected))
 
 
