@@ -154,6 +154,7 @@ def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
             status, _, errors = finished(run)
         if "ip route add" in errors:
             pytest.skip("this machine has no multicast")
+        assert (tmp_path / "can.mcap").exists(), errors
         records = read(tmp_path / "can.mcap").records
         if status == 0 or not records["sample_age"].any():
             break

@@ -209,11 +209,13 @@ def test_it_covers_the_error_of_the_pose_without_and_with_a_fault():
 
 def test_it_grows_where_nothing_is_redundant():
     """Faults of three IMUs show in the pose alone."""
-    levels = []
+    levels, faults = [], []
     for healthy in (1, 0):
         mechanism, r = readings("0.5", 3.0, 4)
         parameters, state = constants(mechanism)
         state["imus"]["healthy"][3:] = healthy
         s = all_steps(mechanism, r, parameters, state)
         levels.append(ended(s["protection"]))
+        faults.append(np.sqrt(s["protection"]["evaluated"]))
     assert (levels[1] > 7.0 * levels[0]).all()
+    assert (faults[1] > 8.0 * faults[0]).all()
