@@ -8,7 +8,7 @@ from typing import ClassVar, TypeVar
 from plant.encoders import EncoderModel
 from plant.errors import InputError
 from plant.files import check_entries
-from plant.imu import STANDARD_GRAVITY, ImuModel
+from plant.imu import STANDARD_GRAVITY, ImuModel, sampled_noise
 from plant.mechanism import Mechanism
 
 _ENDLESS = 1e300
@@ -214,33 +214,44 @@ def drive_settings(mechanism: Mechanism, few_imus: bool = False, **changes: floa
     return _read(DriveSettings, mechanism, changes)
 
 
-def sensor_settings(mechanism: Mechanism, imu: ImuModel, encoder: EncoderModel | None = None) -> FusionSettings:
+def sensor_settings(
+    mechanism: Mechanism, imu: ImuModel, rate: float, encoder: EncoderModel | None = None
+) -> FusionSettings:  # fmt: skip
     """The fusion settings of a mechanism, with what its IMUs and encoders tell where its file has none.
 
-    That is the IMUs' delay, magnetometer rate and ranges, the noise of gyroscopes that have more than the defaults, and the
-    standard deviations that grow with it and with `accelerometer_wander`; and the encoders' noise, play and zeros.
+    That is the IMUs' delay, magnetometer rate and ranges, the noise that their samples have at the loop's rate [Hz] where it is
+    more than the defaults, and the standard deviations that grow with it and with `accelerometer_wander`; and the encoders'
+    noise, play and zeros.
     """
-    wander = imu.accelerometer_wander
-    noisier = max(imu.gyroscope.noise / FusionSettings.gyroscope_noise, 1.0)
+    wander, defaults = imu.accelerometer_wander, FusionSettings()
+    noisier = max(sampled_noise(imu, imu.gyroscope, rate) / defaults.gyroscope_noise, 1.0)
+    of_accelerometers = max(sampled_noise(imu, imu.accelerometer, rate), defaults.mechanism_accelerometer_noise)
+    more = sqrt(of_accelerometers**2 - defaults.mechanism_accelerometer_noise**2)
+    of_legs = hypot(defaults.leg_accelerometer_noise, more)
+    of_platform = hypot(defaults.platform_accelerometer_noise, more)
     # A direction by gyroscopes and accelerometers is as uncertain as the root of the product of their noises.
-    leg_sigma, tilt_sigma = (sqrt(noisier) * each for each in (FusionSettings.leg_sigma, FusionSettings.tilt_sigma))
+    leg_sigma = sqrt(noisier * of_legs / defaults.leg_accelerometer_noise) * defaults.leg_sigma
+    tilt_sigma = sqrt(noisier * of_platform / defaults.platform_accelerometer_noise) * defaults.tilt_sigma
     known = {
         "sensor_delay": imu.latency,
         "sensor_timing": imu.timing,
         "magnetometer_rate": min(imu.magnetometer_rate, _ENDLESS),
         "gyroscope_range": min(imu.gyroscope.reach, _ENDLESS),
         "accelerometer_range": min(imu.accelerometer.reach, _ENDLESS),
-        "gyroscope_noise": noisier * FusionSettings.gyroscope_noise,
-        "mechanism_gyroscope_noise": noisier * FusionSettings.mechanism_gyroscope_noise,
+        "gyroscope_noise": noisier * defaults.gyroscope_noise,
+        "mechanism_gyroscope_noise": noisier * defaults.mechanism_gyroscope_noise,
+        "leg_accelerometer_noise": of_legs,
+        "platform_accelerometer_noise": of_platform,
+        "mechanism_accelerometer_noise": of_accelerometers,
         "leg_sigma": hypot(leg_sigma, wander / STANDARD_GRAVITY),
         "tilt_sigma": hypot(tilt_sigma, wander / STANDARD_GRAVITY),
-        "accelerometer_bias_sigma": hypot(FusionSettings.accelerometer_bias_sigma, wander),
+        "accelerometer_bias_sigma": hypot(defaults.accelerometer_bias_sigma, wander),
     }
     if encoder is not None:
         step = encoder.resolution / sqrt(12.0)
         known["length_noise"] = max(hypot(encoder.noise, step), _LEAST_LENGTH_NOISE)
         known["length_play"] = max(hypot(0.5 * encoder.backlash, step), _LEAST_LENGTH_NOISE)
-        known["length_zero"] = max(encoder.zero, _LEAST_LENGTH_NOISE) if encoder.absolute else FusionSettings.length_zero
+        known["length_zero"] = max(encoder.zero, _LEAST_LENGTH_NOISE) if encoder.absolute else defaults.length_zero
     own = mechanism.settings.get("fusion", {})
     return fusion_settings(mechanism, **{name: value for name, value in known.items() if name not in own})
 

@@ -266,7 +266,7 @@ def linear_estimator(
     """The estimator, from IMU signals (42,) to the n lengths [m] and the feed-forward of the load for each [m/s], with
     covariances after such signals for so long [s].
     """
-    fusion = fusion_settings(mechanism) if setup.imu is None else sensor_settings(mechanism, setup.imu)
+    fusion = fusion_settings(mechanism) if setup.imu is None else sensor_settings(mechanism, setup.imu, setup.rate)
     parameters = cycle_parameters(
         mechanism, setup.rate, control_settings(mechanism), fusion, position_drives=setup.bandwidth is not None
     )

@@ -116,7 +116,7 @@ class CalibrationData:
     def __init__(self, mechanism: Mechanism, imu: str, rate: float, knowledge: Knowledge, seed: int) -> None:
         """Start without a rest; `rate` is in Hz, and `seed` that of the noise of measured lengths."""
         self.mechanism, self.imu, self.rate, self.knowledge = mechanism, imu, rate, knowledge
-        self.fusion = sensor_settings(mechanism, load_imu(imu), knowledge.encoder)
+        self.fusion = sensor_settings(mechanism, load_imu(imu), rate, knowledge.encoder)
         self.zero = np.zeros((IMU_COUNT, 3))
         self.readings, self.base_readings = np.zeros((0, IMU_COUNT, 6)), np.zeros((0, 6))
         self.truth, self._lengths, self._runs = np.zeros((0, 7)), np.zeros((0, LEGS)), np.zeros(0)

@@ -191,7 +191,7 @@ def expected_accuracy(mechanism: Mechanism, resting: Target, knowledge: Knowledg
     lengths = None
     if knowledge.encoder is not None:
         exact = leg_lengths(mechanism, resting.positions, resting.rotations)
-        fusion = sensor_settings(mechanism, load_imu("ideal"), knowledge.encoder)
+        fusion = sensor_settings(mechanism, load_imu("ideal"), 1.0 / REST_S, knowledge.encoder)
         lengths = measured_lengths(exact, np.zeros(len(exact)), fusion)
     found = calibrate_at_rest(mechanism, Rests(_readings(mechanism, resting), knowledge.home, lengths), knowledge.prior)
     _, positions, rotations = rests(mechanism, WIDE_RESTS * REST_S)

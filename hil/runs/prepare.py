@@ -135,7 +135,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
             raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
         add_disturbances(imu, (each.later(control.hold) for each in config.disturbances))
         encoder_faults = [each.later(control.hold) for each in config.encoder_faults]
-        fusion, safety = sensor_settings(mechanism, model, encoder), safety_settings(mechanism)
+        fusion, safety = sensor_settings(mechanism, model, config.rate, encoder), safety_settings(mechanism)
         drives = drive_settings(mechanism, are_few(mechanism, config.imus))
         if config.raw_imus:
             safety, drives = safety.for_raw_imus(), drives.for_raw_imus()

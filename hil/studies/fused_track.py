@@ -95,7 +95,7 @@ def track(fused: Record, step: int) -> PoseTrack:
 
 def constants(mechanism: Mechanism, imu: str, rate: float, fusion: str, calibration: Calibration | None = None) -> Record:
     """The cycle's constants with all IMUs; `fusion` is a key of `hil.runs.config.FUSIONS`."""
-    control, sensors = control_settings(mechanism), sensor_settings(mechanism, load_imu(imu))
+    control, sensors = control_settings(mechanism), sensor_settings(mechanism, load_imu(imu), rate)
     section_5 = fusion == "section-5"
     return cycle_parameters(mechanism, rate, control, sensors, ALL_IMUS, FUSIONS[fusion], calibration, section_5, section_5)
 

@@ -241,7 +241,7 @@ def tune_fusion(config: TuningConfig, engine: Engine = IN_ONE_PROCESS, progress:
     Raises:
         GoughError: something in the configuration cannot be used, or noise cannot explain the IMUs' errors.
     """
-    before = fusion = sensor_settings(load_spatial(config.mechanism), load_imu(config.imu))
+    before = fusion = sensor_settings(load_spatial(config.mechanism), load_imu(config.imu), config.rate)
     consistency = partial(_consistency, config, engine, uuid4().hex)
     stages = len(STEPS) + 2  # First figures before, last figures after.
     figures_before = consistency(before)

@@ -1,6 +1,6 @@
 """IMU imperfections: from the ideal signals of a plant to the raw data of its IMUs."""
 
-from plant.imu.aliasing import aliasing_remark
+from plant.imu.aliasing import aliasing_remark, sampled_noise
 from plant.imu.disturbed import DISTURBANCE, MOST_DISTURBANCES, disturbance_record
 from plant.imu.model import MILLI_G, STANDARD_GRAVITY, ImuModel, SensorErrors
 from plant.imu.presets import PRESETS, load_imu, text_of_imu
@@ -38,5 +38,6 @@ __all__ = [
     "load_imu",
     "measure",
     "philox",
+    "sampled_noise",
     "text_of_imu",
 ]

@@ -1,4 +1,6 @@
-"""Aliasing: vibration that a sensor's low-pass does not take away before it is sampled."""
+"""Aliasing: vibration and noise that a sensor's low-pass does not take away before it is sampled."""
+
+from math import sqrt
 
 from plant.imu.model import ImuModel, SensorErrors
 
@@ -6,6 +8,17 @@ from plant.imu.model import ImuModel, SensorErrors
 def low_pass_gain(sensor: SensorErrors, frequency: float) -> float:
     """The share of a vibration of this frequency [Hz] that passes a sensor's low-pass."""
     return float((1.0 + (frequency / sensor.section_bandwidth) ** 2) ** (-0.5 * sensor.order))
+
+
+def sampled_noise(model: ImuModel, sensor: SensorErrors, rate: float) -> float:
+    """The noise density of a sensor's samples when they are taken at this rate [Hz], with what aliases of it [unit/sqrt(Hz)].
+
+    Where a sample is of several conversions, noise beyond half the rate of samples adds to the noise below it.
+    """
+    sampled = min(model.sample_rate or rate, rate)
+    conversions = max(1, round(model.conversion_rate / sampled))
+    passed = (low_pass_gain(sensor, k * sampled) for k in range(-(conversions // 2), conversions - conversions // 2))
+    return sensor.noise * sqrt(sum(gain**2 for gain in passed))
 
 
 def aliasing_remark(model: ImuModel, rate: float) -> str:

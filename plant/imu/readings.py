@@ -17,6 +17,7 @@ import numpy as np
 from plant.checks import checked_seed
 from plant.compiled import MOST, Limits, Record, kernel, record_dtype, shared_kernel
 from plant.errors import InputError
+from plant.imu.aliasing import sampled_noise
 from plant.imu.disturbed import DISTURBANCE, EFFECT, MOST_DISTURBANCES, clock_of, disturb, disturbance_record, shakes
 from plant.imu.model import MOST_SECTIONS, ImuModel, SensorErrors
 from plant.imu.random_numbers import draw_normals
@@ -149,7 +150,8 @@ def imu_state(
                 state[name][kind, imu] = (np.abs(read) if name.startswith("scale") else read) @ change[imu]
         state["rectification"][kind] = sensor.rectification
         for spared, converting in enumerate(periods):
-            state["noise"][spared, kind] = sensor.noise * sqrt(0.5 / converting)
+            density = sampled_noise(model, sensor, 1.0 / sampling) if spared and kind != MAGNETOMETER else sensor.noise
+            state["noise"][spared, kind] = density * sqrt(0.5 / converting)
             state["smoothing"][spared, kind] = _smoothing(sensor.section_bandwidth, converting)
         state["order"][kind] = sensor.order
         state["reach"][kind] = sensor.reach

@@ -1,6 +1,6 @@
 """Settings: defaults, the preset's tables, changes by name, and what is refused."""
 
-from dataclasses import FrozenInstanceError, asdict, fields
+from dataclasses import FrozenInstanceError, asdict, fields, replace
 
 import numpy as np
 import pytest
@@ -171,7 +171,7 @@ IMU = ImuModel(
 
 
 def test_the_imus_tell_their_delay_their_ranges_and_the_magnetometers_rate(hexapod):
-    found = sensor_settings(mechanism_with(hexapod, fusion={"leg_sigma": 2e-3}), IMU)
+    found = sensor_settings(mechanism_with(hexapod, fusion={"leg_sigma": 2e-3}), IMU, 1000.0)
     expected = FusionSettings(
         leg_sigma=2e-3, magnetometer_rate=25.0, gyroscope_range=5.0, accelerometer_range=30.0,
         sensor_delay=0.003 + 0.5 * (1.0 / (2.0 * np.pi * 100.0) + 1.0 / (2.0 * np.pi * 50.0)),
@@ -181,10 +181,14 @@ def test_the_imus_tell_their_delay_their_ranges_and_the_magnetometers_rate(hexap
 
 @pytest.mark.parametrize("name", ["sensor_delay", "magnetometer_rate", "gyroscope_range", "accelerometer_range"])
 def test_what_the_mechanisms_file_says_of_its_imus_goes_before_what_they_tell(hexapod, name):
-    own, told = sensor_settings(mechanism_with(hexapod, fusion={name: 7.0}), IMU), sensor_settings(hexapod, IMU)
+    own, told = sensor_settings(mechanism_with(hexapod, fusion={name: 7.0}), IMU, 1000.0), sensor_settings(hexapod, IMU, 1000.0)
     assert getattr(own, name) == 7.0
     for field in fields(FusionSettings):
         assert field.name == name or getattr(own, field.name) == getattr(told, field.name)
+
+
+def without_aliases(imu):
+    return replace(imu, conversion_rate=0.0, sparing=False)
 
 
 WANDERING = ("leg_sigma", "tilt_sigma", "accelerometer_bias_sigma")
@@ -192,27 +196,58 @@ WANDERING = ("leg_sigma", "tilt_sigma", "accelerometer_bias_sigma")
 
 def test_accelerometers_that_wander_make_directions_and_biases_less_certain(hexapod):
     imu = load_imu("mpu9150-nominal")
-    found, usual = sensor_settings(hexapod, imu), fusion_settings(hexapod)
+    found, usual = (sensor_settings(hexapod, each, 1000.0) for each in (imu, replace(imu, disturbances=())))
     for name, wander in zip(WANDERING, np.array([1.0, 1.0, 9.80665]) * imu.accelerometer_wander / 9.80665, strict=True):
         assert getattr(found, name) ** 2 - getattr(usual, name) ** 2 == pytest.approx(wander**2)
-    own = sensor_settings(mechanism_with(hexapod, fusion={"leg_sigma": 2e-3}), imu)
+    own = sensor_settings(mechanism_with(hexapod, fusion={"leg_sigma": 2e-3}), imu, 1000.0)
     assert (own.leg_sigma, own.tilt_sigma, own.accelerometer_bias_sigma) == (2e-3, *(getattr(found, n) for n in WANDERING[1:]))
 
 
 @pytest.mark.parametrize("name", ["ideal", "mpu9150", "mpu9150-calibrated", "icm42688"])
 def test_imus_that_do_not_wander_leave_the_standard_deviations_to_the_bit(hexapod, name):
-    found = sensor_settings(hexapod, load_imu(name))
+    found = sensor_settings(hexapod, without_aliases(load_imu(name)), 1000.0)
     assert all(getattr(found, each) == getattr(fusion_settings(hexapod), each) for each in WANDERING)
 
 
 def test_noisier_gyroscopes_count_less_and_make_directions_less_certain(hexapod):
-    imu, usual = load_imu("bmi088-calibrated"), fusion_settings(hexapod)
-    found = sensor_settings(hexapod, imu)
+    imu, usual = without_aliases(load_imu("bmi088-calibrated")), fusion_settings(hexapod)
+    imu = replace(imu, accelerometer=replace(imu.accelerometer, noise=0.004))
+    found = sensor_settings(hexapod, imu, 1000.0)
     assert found.gyroscope_noise == pytest.approx(imu.gyroscope.noise)
     for name, power in (("mechanism_gyroscope_noise", 1.0), ("leg_sigma", 0.5), ("tilt_sigma", 0.5)):
         assert getattr(found, name) / getattr(usual, name) == pytest.approx((0.014 / 0.005) ** power)
-    quiet = sensor_settings(hexapod, load_imu("lsm6dso-calibrated"))
+    quiet = sensor_settings(hexapod, load_imu("lsm6dso-calibrated"), 1000.0)
     assert quiet.gyroscope_noise == usual.gyroscope_noise and quiet.leg_sigma == usual.leg_sigma
+
+
+def test_noisier_accelerometers_count_less_and_make_directions_less_certain(hexapod):
+    """What their noise is above the usual one adds to what the filters of a leg and of the platform assume."""
+    imu, usual = without_aliases(load_imu("mpu9150-calibrated")), fusion_settings(hexapod)
+    found = sensor_settings(hexapod, replace(imu, accelerometer=replace(imu.accelerometer, noise=0.02)), 1000.0)
+    assert found.mechanism_accelerometer_noise == 0.02
+    for name, sigma in (("leg_accelerometer_noise", "leg_sigma"), ("platform_accelerometer_noise", "tilt_sigma")):
+        noise = getattr(found, name)
+        assert noise**2 - getattr(usual, name) ** 2 == pytest.approx(0.02**2 - usual.mechanism_accelerometer_noise**2)
+        assert getattr(found, sigma) / getattr(usual, sigma) == pytest.approx(np.sqrt(noise / getattr(usual, name)))
+    assert found.gyroscope_noise == usual.gyroscope_noise
+
+
+@pytest.mark.parametrize("rate", [125.0, 250.0, 1000.0])
+def test_noise_that_aliases_counts(hexapod, rate):
+    """Below the rate of samples, white noise that a low-pass of first order, time constant tau, has filtered has the density
+    times the root of x coth(x), x = 1 / (2 rate tau).
+    """
+    imu, usual = replace(load_imu("mpu9150-calibrated"), conversion_rate=400e3), fusion_settings(hexapod)
+    found = sensor_settings(hexapod, imu, rate)
+    for width, density, got in (
+        (256.0, imu.gyroscope.noise, found.gyroscope_noise),
+        (256.0, usual.mechanism_gyroscope_noise, found.mechanism_gyroscope_noise),
+        (260.0, imu.accelerometer.noise, found.mechanism_accelerometer_noise),
+    ):
+        x = np.pi * width / rate
+        assert got == pytest.approx(density * np.sqrt(x / np.tanh(x)), rel=2e-3)
+    slow = replace(imu, sample_rate=0.5 * rate)
+    assert sensor_settings(hexapod, slow, rate).gyroscope_noise == sensor_settings(hexapod, imu, 0.5 * rate).gyroscope_noise
 
 
 def test_clocks_of_their_own_make_the_times_of_samples_uncertain(hexapod):
@@ -220,12 +255,12 @@ def test_clocks_of_their_own_make_the_times_of_samples_uncertain(hexapod):
     imu = load_imu("icm42688-nominal")
     waits = np.random.default_rng(0).uniform(0.0, 1.0 / imu.sample_rate, 20000)
     times = waits + imu.jitter * np.random.default_rng(1).normal(size=waits.size)
-    assert sensor_settings(hexapod, imu).sensor_timing == pytest.approx(np.std(times), rel=0.02)
-    assert sensor_settings(hexapod, load_imu("mpu9150")).sensor_timing == 0.0
+    assert sensor_settings(hexapod, imu, 1000.0).sensor_timing == pytest.approx(np.std(times), rel=0.02)
+    assert sensor_settings(hexapod, load_imu("mpu9150"), 1000.0).sensor_timing == 0.0
 
 
 def test_ranges_and_rates_without_an_end_are_finite_settings(hexapod):
-    found = sensor_settings(hexapod, load_imu("ideal"))
+    found = sensor_settings(hexapod, load_imu("ideal"), 1000.0)
     assert found.sensor_delay == 0.0
     for value in (found.magnetometer_rate, found.gyroscope_range, found.accelerometer_range):
         assert 1e12 < value < np.inf

@@ -80,7 +80,7 @@ def find_bounds(runs: Sequence[Disturbed], uncertainty: Uncertainty) -> list[Bou
         GoughError: the mechanism, the target or the IMUs cannot be used.
     """
     config = runs[0].config
-    model = _model(config.mechanism, config.target, config.duration, config.imu, uncertainty)
+    model = _model(config.mechanism, config.target, config.duration, config.imu, config.rate, uncertainty)
     data = np.stack([_signature(run) for run in runs], axis=2)[: len(model.sensitivity)]
     found = whitened(model, data)
     return [_bound(found, data, i, run) for i, run in enumerate(runs)]
@@ -114,9 +114,9 @@ def _motion(name: str, target: str, duration: float, period: float, first: float
 
 # Each takes 100 MB for 20 s.
 @lru_cache(maxsize=4)
-def _model(name: str, target: str, duration: float, imu: str, uncertainty: Uncertainty) -> LinearModel:
+def _model(name: str, target: str, duration: float, imu: str, rate: float, uncertainty: Uncertainty) -> LinearModel:
     mechanism, motion, _ = _motion(name, target, duration, STEP_S, 0.5 * STEP_S - REST_S)
-    return linear_model(mechanism, motion, load_imu(imu), uncertainty, STEP_S)
+    return linear_model(mechanism, motion, load_imu(imu), rate, uncertainty, STEP_S)
 
 
 def _bound(found: Whitened, data: Array, column: int, run: Disturbed) -> Bound:

@@ -19,7 +19,7 @@ from scipy.linalg import solve_triangular
 
 from hil.studies.detectability.kinematics import JET, POSE, Motion, sensitivity
 from hil.studies.detectability.uncertainty import Uncertainty
-from plant.imu.model import ImuModel
+from plant.imu import ImuModel, sampled_noise
 from plant.imu_wiring import IMU_COUNT
 from plant.mechanism import LEGS, Mechanism
 from plant.pose import Array
@@ -78,9 +78,9 @@ class Whitened(NamedTuple):
 
 
 def linear_model(
-    mechanism: Mechanism, motion: Motion, imu: ImuModel, uncertainty: Uncertainty, step: float
+    mechanism: Mechanism, motion: Motion, imu: ImuModel, rate: float, uncertainty: Uncertainty, step: float
 ) -> LinearModel:  # fmt: skip
-    """The model along a motion at times that are `step` [s] apart."""
+    """The model along a motion at times that are `step` [s] apart, of samples at a rate [Hz]."""
     u = uncertainty
     seen = np.zeros((len(motion.position), DATA, STATES))
     seen[:, :, :JET] = sensitivity(mechanism, motion)
@@ -88,7 +88,8 @@ def linear_model(
     seen[:, :SENSORS, _WANDER] = np.eye(SENSORS)
     seen[:, SENSORS:, _DRIVES] = np.eye(LEGS)
     # White noise of density n, one-sided, has the variance n^2 / (2 T) in the mean over T.
-    densities = np.r_[_per_axis(imu.gyroscope.noise, imu.accelerometer.noise), [u.drive_noise] * LEGS]
+    of_imus = _per_axis(*(sampled_noise(imu, sensor, rate) for sensor in (imu.gyroscope, imu.accelerometer)))
+    densities = np.r_[of_imus, [u.drive_noise] * LEGS]
     transition, driving = np.eye(STATES), np.zeros((STATES, STATES))
     powers = step ** np.arange(3) / np.array([1.0, 1.0, 2.0])
     for i in range(3):

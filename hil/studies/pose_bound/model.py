@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 from controller.calibration.file import Calibration
 from hil.studies.detectability.kinematics import BASE_JET, JET, POSE, Motion, Signals, sensitivity, signals
 from plant.encoders import EncoderModel
-from plant.imu.model import ImuModel, SensorErrors
+from plant.imu import ImuModel, SensorErrors, sampled_noise
 from plant.imu_wiring import BASE_IMU, IMU_COUNT, PLATFORM_IMU
 from plant.mechanism import Mechanism
 from plant.pose import Array, rotation_from_vector
@@ -129,10 +129,12 @@ class LinearModel:
         """(rows,): the variances of the data's white noise."""
         s, legs = self.setup, len(self.setup.legs_with_encoder)
         rate = min(s.imu.sample_rate or inf, s.rate)
-        imu = [_noise(s.imu.gyroscope, rate, "gyroscope")] * 3 + [_noise(s.imu.accelerometer, rate, "accelerometer")] * 3
-        field = [_noise(s.imu.magnetometer, min(rate, s.imu.magnetometer_rate), "magnetometer")] * 3
+        sensors = ("gyroscope", s.imu.gyroscope), ("accelerometer", s.imu.accelerometer)
+        imu = np.repeat([_noise(sensor, sampled_noise(s.imu, sensor, rate), rate, name) for name, sensor in sensors], 3)
+        magnetometer = s.imu.magnetometer
+        field = [_noise(magnetometer, magnetometer.noise, min(rate, s.imu.magnetometer_rate), "magnetometer")] * 3
         length = [max(s.encoder.noise, _LEAST_LENGTH_NOISE) ** 2 / (s.rate * STEP_S)] * legs if s.encoder else []
-        return np.array(imu * len(s.imus) + field * s.magnetometer + length)
+        return np.array([*imu] * len(s.imus) + field * s.magnetometer + length)
 
     @cached_property
     def transition(self) -> Array:
@@ -346,7 +348,7 @@ def _variances(sensor: SensorErrors) -> tuple[float, float, float]:
     return (least**2 + least * most + most**2) / 9.0, sensor.scale**2 / 3.0, sensor.cross_axis**2 / 3.0
 
 
-def _noise(sensor: SensorErrors, rate: float, name: str) -> float:
+def _noise(sensor: SensorErrors, density: float, rate: float, name: str) -> float:
     """The variance of the mean of a sensor's samples over a step; white noise of density n, one-sided, leaves n^2 / (2 T)."""
     steps = sensor.resolution**2 / 12.0 / (rate * STEP_S)
-    return max(sensor.noise, _LEAST_NOISE[name]) ** 2 / (2.0 * STEP_S) + steps
+    return max(density, _LEAST_NOISE[name]) ** 2 / (2.0 * STEP_S) + steps

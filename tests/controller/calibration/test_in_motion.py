@@ -29,7 +29,7 @@ def moved(mechanism, duration):
 
 @pytest.mark.slow
 def test_motion_brings_it_to_a_tenth_of_a_millimetre(hexapod):
-    fusion = sensor_settings(hexapod, RAW)
+    fusion = sensor_settings(hexapod, RAW, 1000.0)
     readings, _, _ = rests_of(hexapod, 20, 1)
     found = calibrate_at_rest(hexapod, Rests(readings))
     imu, _, motion = moved(hexapod, 20.0)
@@ -67,7 +67,7 @@ def test_encoders_tell_more_than_a_longer_motion_without(hexapod):
     lengths = leg_lengths(hexapod, imposed.positions, imposed.rotations) + random.normal(0.0, 0.03, 6)
     lengths = 5e-6 * np.rint(lengths / 5e-6)
     lengths[random.random(lengths.shape) < 0.1] = np.nan
-    fusion = sensor_settings(hexapod, RAW, PRESETS["incremental"])
+    fusion = sensor_settings(hexapod, RAW, 1000.0, PRESETS["incremental"])
     others = rests_of(hexapod, 10, 1, poses=sample_workspace(hexapod, 10, seed=999))
     errors, predicted = [], []
     for read in (lengths, None):
@@ -81,7 +81,7 @@ def test_encoders_tell_more_than_a_longer_motion_without(hexapod):
 
 @pytest.mark.endurance
 def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
-    built, fusion = hexapod.built(2e-4, 3), sensor_settings(hexapod, RAW)
+    built, fusion = hexapod.built(2e-4, 3), sensor_settings(hexapod, RAW, 1000.0)
     readings, _, _ = rests_of(built, 20, 1)
     _, _, motion = moved(built, 20.0)
     others, surprise = rests_of(built, 10, 1, poses=sample_workspace(built, 10, seed=999)), []
@@ -114,7 +114,7 @@ def test_joints_that_are_off_are_sought_with_the_rest(hexapod):
 @pytest.mark.slow
 def test_missed_periods_cost_what_was_not_read_alone(hexapod):
     """Taken for readings, the samples that stand for missed ones would bend the calibration."""
-    fusion = sensor_settings(hexapod, RAW)
+    fusion = sensor_settings(hexapod, RAW, 1000.0)
     readings, _, _ = rests_of(hexapod, 20, 1)
     found = calibrate_at_rest(hexapod, Rests(readings))
     _, _, motion = moved(hexapod, 10.0)

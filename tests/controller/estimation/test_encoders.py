@@ -29,7 +29,7 @@ class Bench:
     def __init__(self, name):
         self.mechanism = load_in_space(name)
         encoder = load_encoder("ideal")
-        known = sensor_settings(self.mechanism, load_imu("ideal"), encoder)
+        known = sensor_settings(self.mechanism, load_imu("ideal"), 1000.0, encoder)
         self.parameters = encoder_parameters(encoder, known, self.mechanism, lead=True)
         self.estimator = pose_estimator.pose_parameters(FUSION, False)
         self.rig = rig_parameters(self.mechanism, 1000.0, 0.2, np.zeros(2))
@@ -123,7 +123,7 @@ def test_directions_of_legs_make_up_for_it_too():
 def test_a_zero_is_the_mean_of_what_the_imus_say_weighted_by_the_time_before():
     """Their lengths are means over time themselves, and get better; without new ones the pose stays where the encoders are."""
     mechanism, encoder = load_in_space("hexapod"), load_encoder("incremental")
-    parameters = encoder_parameters(encoder, sensor_settings(mechanism, load_imu("ideal"), encoder), mechanism)
+    parameters = encoder_parameters(encoder, sensor_settings(mechanism, load_imu("ideal"), 1000.0, encoder), mechanism)
     rig, home = rig_parameters(mechanism, 1000.0, 0.2, np.zeros(2)), mechanism.home
     encoders, pose, time = np.zeros((), STATE), np.zeros((), pose_estimator.STATE), np.zeros((), TIME)
     pose["information"], pose["factor"] = np.eye(6), np.eye(6)
@@ -143,7 +143,7 @@ def test_a_zero_is_the_mean_of_what_the_imus_say_weighted_by_the_time_before():
 def test_how_far_an_unseen_error_moves_the_pose(name):
     """As far as the pose goes when one reading is off by that; the encoder that moves it the most counts."""
     mechanism, encoder = load_in_space(name), load_encoder("absolute")
-    parameters = encoder_parameters(encoder, sensor_settings(mechanism, load_imu("ideal"), encoder), mechanism)
+    parameters = encoder_parameters(encoder, sensor_settings(mechanism, load_imu("ideal"), 1000.0, encoder), mechanism)
     rig, home, legs = rig_parameters(mechanism, 1000.0, 0.2, np.zeros(2)), mechanism.home, range(mechanism.legs)
     time, lengths, unseen = np.zeros((), TIME), np.zeros(LEGS), np.linspace(1e-5, 3e-5, LEGS)
     lengths[: mechanism.legs] = leg_lengths(mechanism, home.position, home.rotation)
@@ -170,7 +170,7 @@ def test_how_far_an_unseen_error_moves_the_pose(name):
 def test_a_home_switch_makes_a_zero_exact_to_where_it_was_passed():
     """Between two readings; not where one is missing, where they are far apart, or where the switch was not known before."""
     mechanism, model = load_in_space("hexapod"), EncoderModel("homed", switches=(0.4,) * LEGS)
-    parameters = encoder_parameters(model, sensor_settings(mechanism, load_imu("ideal"), model), mechanism)
+    parameters = encoder_parameters(model, sensor_settings(mechanism, load_imu("ideal"), 1000.0, model), mechanism)
     encoders = np.zeros((), STATE)
     encoders["home"] = [0, 0, 0, 0, -1, 0]
     encoders["carried"], encoders["zero"], encoders["followed_for"] = 0.4998, 0.099, 2.0

@@ -42,7 +42,7 @@ class Bench:
         self.signals = ideal_signals(mechanism)(mechanism.require_home(), still, still)
         for imu in turned:
             self.signals[ACCELEROMETER, imu] *= -1.0
-        settings = control_settings(mechanism), sensor_settings(mechanism, load_imu("mpu9150"))
+        settings = control_settings(mechanism), sensor_settings(mechanism, load_imu("mpu9150"), 200.0)
         self.parameters = cycle_parameters(mechanism, 200.0, *settings)
         self.machine = Machine(self.run, lambda config: self.found)
         self.guide = Guide(lambda number, count, step: self.announced.append((number, count, step.name)), self.told.append)

@@ -23,7 +23,7 @@ def short_model(hexapod):
     """Of 60 steps along `sines`, from its rest on."""
     target = load_target("sines", hexapod, 2.0)
     motion = motion_along(target, hexapod, STEP_S * (np.arange(60) + 0.5) - 0.2)
-    return linear_model(hexapod, motion, load_imu("mpu9150-calibrated"), Uncertainty(), STEP_S)
+    return linear_model(hexapod, motion, load_imu("mpu9150-calibrated"), 1000.0, Uncertainty(), STEP_S)
 
 
 def draw(model, columns, seed):

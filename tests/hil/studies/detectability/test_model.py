@@ -70,7 +70,7 @@ def test_uncertainty_about_drives_and_sensors_makes_estimates_worse(hexapod, sho
     nothing = np.zeros((60, DATA, 1))
     sizes = [np.trace(whitened(short_model, nothing).covariances[-1])]
     for worse in ({"drive_rate": 1.0, "drive_noise": 1.0}, {"gyroscope_bias": 0.01}, {"accelerometer_wander": 0.05}):
-        model = linear_model(hexapod, motion, load_imu("mpu9150-calibrated"), Uncertainty(**worse), STEP_S)
+        model = linear_model(hexapod, motion, load_imu("mpu9150-calibrated"), 1000.0, Uncertainty(**worse), STEP_S)
         sizes.append(np.trace(whitened(model, nothing).covariances[-1]))
     assert min(sizes[1:]) > sizes[0]
 
