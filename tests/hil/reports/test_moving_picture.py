@@ -91,7 +91,7 @@ def test_the_platform_and_its_ghost_have_the_poses_of_the_run(results, pictures,
     assert (shares[0], shares[-1]) == (0.0, 1.0) and 5 < len(shares) < 80
     expected = pixels(result.mechanism, picture, joints_of(result, rows_at(result, shares), drawn))
     for corner in corners.swapaxes(0, 1):
-        assert min(np.abs(corner - joint).max() for joint in expected.swapaxes(0, 1)) < 0.15
+        assert min(np.abs(corner - joint).max() for joint in expected.swapaxes(0, 1)) < 0.2
     # And in between.
     times = np.linspace(0.0, 1.0, 200)
     expected = pixels(result.mechanism, picture, joints_of(result, rows_at(result, times), drawn))
@@ -118,8 +118,8 @@ def test_the_legs_join_base_and_platform_and_have_the_colours_of_their_stroke(re
         upper, lower = course(rod)[1], course(tube)[1]
         leg = int(np.argmin(np.abs(ends - upper[:, None, 1]).sum(axis=(0, 2))))
         found.add(leg)
-        np.testing.assert_allclose(upper[:, 1], ends[:, leg], atol=0.15)
-        np.testing.assert_allclose(lower[:, 0], np.broadcast_to(base[leg], (len(rows), 2)), atol=0.15)
+        np.testing.assert_allclose(upper[:, 1], ends[:, leg], atol=0.2)
+        np.testing.assert_allclose(lower[:, 0], np.broadcast_to(base[leg], (len(rows), 2)), atol=0.2)
         np.testing.assert_array_equal(lower[:, 1], upper[:, 0])
         colors = np.array([list(bytes.fromhex(color[1:])) for color in course(tube, "stroke")[1]])
         assert np.abs(colors - expected[:, leg]).max() <= 1

@@ -116,7 +116,7 @@ def test_four_legs_alone_hold_the_platform_with_the_whole_mechanism_filter(seed)
     assert result.summary()["estimation"]["position_rms"] < 4e-3
 
 
-@pytest.mark.parametrize("seed", [2, 4])
+@pytest.mark.parametrize("seed", [2, 8])
 def test_a_mechanism_that_chatters_in_its_play_is_stopped(seed):
     """0.5 mm of clearance: from one second on the legs go to and fro by 1 mm at 18 Hz, and on and on."""
     play = Setting("joint.clearance", (5e-4,))
