@@ -59,6 +59,7 @@ def test_every_example_is_tried() -> None:
     assert len(re.findall("```python", PAGE)) == 5
 
 
+@pytest.mark.slow
 def test_fmpy_simulates_both_interfaces(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     names = run("FMPy")
@@ -94,6 +95,7 @@ def test_the_linear_plant_is_one_of_python_control(folder: Path, monkeypatch: py
     assert f"# {gain:.2f} m/s per m/s" in EXAMPLES["Linearise"][0]
 
 
+@pytest.mark.slow
 def test_the_commands_exist(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Those that take no time are run, too."""
     monkeypatch.chdir(folder)

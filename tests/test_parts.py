@@ -23,5 +23,6 @@ def test_each_test_is_in_one_part() -> None:
     assert sorted(name for part in parts for name in part) == sorted(collected())
 
 
+@pytest.mark.slow
 def test_a_part_that_is_none_is_refused() -> None:
     assert not collected("--part", "4/3") and not collected("--part", "2")

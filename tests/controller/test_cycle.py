@@ -224,6 +224,7 @@ def misled_tilt(mechanism, signals, rotations):
     return np.sqrt(np.mean(np.sum(np.cross(forces, verticals) ** 2, axis=1)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("imus", [ALL_IMUS, LEG_IMUS, (0, 2, 3, 5, PLATFORM_IMU)])
 def test_a_moving_platform_is_followed_by_ideal_imus_wherever_they_sit(hexapod, imus):
     """Its own acceleration, up to 2 m/s^2 and that of the turns, is not taken for gravity; nor are the legs'."""

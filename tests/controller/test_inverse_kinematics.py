@@ -42,6 +42,7 @@ def test_a_leg_by_hand():
     np.testing.assert_allclose(legs.jacobian[0, 3:], np.array([0.06, 0.12, -0.05]) / np.sqrt(0.61), rtol=1e-13)
 
 
+@pytest.mark.slow
 @settings(max_examples=80, deadline=None)
 @given(TURNS, st.integers(0, 2**32 - 1), st.booleans())
 def test_length_rates_are_the_jacobian_times_the_twist(turn, seed, anywhere):

@@ -60,6 +60,7 @@ def test_at_rest_the_pose_is_right_at_once_or_the_imus_are_refused(hexapod, seed
     assert kinds == set(AXES)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", SEEDS)
 def test_the_axes_that_a_refusal_names_help(hexapod, seeds):
     helped = helpless = 0

@@ -264,6 +264,7 @@ def by_qr_and_by_normal_equations(matrix, right, rank):
     return (ratio, solution, null_space[: n - rank]), (found_ratio, found, found_space[: n - rank])
 
 
+@pytest.mark.slow
 @settings(max_examples=150, deadline=None)
 @given(st.sampled_from([5, 9]), st.data())
 def test_where_they_are_well_conditioned_normal_equations_give_what_the_qr_gives(n, data):

@@ -28,6 +28,7 @@ def times(gains, factor):
     return replace(gains, proportional=factor * gains.proportional, integral=factor * gains.integral)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "load", "rate", "gains"),
     [("hexapod", 1.0, 1000.0, (60.0, 200.0, 0.0)), ("genhexkins", 5.0, 250.0, (90.0, 300.0, 0.05))],

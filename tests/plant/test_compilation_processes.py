@@ -155,6 +155,7 @@ def disturb(monkeypatch: pytest.MonkeyPatch, kernel: str, what: Callable[..., No
     monkeypatch.setattr(processes, "_compile_one", compile_or_not)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", [dies, hangs, fails])
 def test_what_workers_leave_undone_is_compiled_here(
     kernels: ModuleType, monkeypatch: pytest.MonkeyPatch, what: Callable[..., None]

@@ -199,6 +199,7 @@ def test_a_cache_that_cannot_be_written_gives_way_to_temporary_files(monkeypatch
     assert keyed_folder("things", "key") == folder
 
 
+@pytest.mark.slow
 def test_machine_code_is_kept_in_the_cache_alone(tmp_path: Path) -> None:
     """A fresh process compiles into the cache folder; the next one compiles nothing, nor does one on a copy of the sources."""
     code = (
@@ -311,6 +312,7 @@ def test_a_shared_kernel_is_compiled_once_for_all_callers_and_processes(tmp_path
     assert called("inner.py_func", "first", before="inner.py_func = lambda record: 0.0") == ["0.0", "17.0", ""]
 
 
+@pytest.mark.slow
 def test_an_edit_where_kernels_are_gives_a_new_folder(tmp_path: Path) -> None:
     """The sources are copied, one file is edited, and the kernels of another file move to another folder."""
     root = Path(__file__).resolve().parents[2]

@@ -70,6 +70,7 @@ def test_what_is_installed_is_not_complained_about():
         check_installed(package)
 
 
+@pytest.mark.slow
 def test_a_run_needs_no_extra():
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({list(EXTRAS)!r}));"

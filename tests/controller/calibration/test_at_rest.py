@@ -121,6 +121,7 @@ def test_the_mounting_of_the_magnetometers_is_undone_as_that_of_the_acceleromete
     assert not offset[2].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_an_imu_on_the_base_errs_less_on_a_tilted_base_once_its_share_of_each_error_is_known(hexapod, seed):
     random, prior = np.random.default_rng(seed), Prior(accelerometer_bias=0.1, alignment=np.radians(1.0))
@@ -206,6 +207,7 @@ def test_lengths_with_known_zeros_tell_the_poses_themselves(hexapod, skewed):
     np.testing.assert_allclose(found.positions, poses[0], rtol=0.0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_zero_that_changes_between_two_runs_does_not_matter_if_that_is_known(hexapod, skewed):
     readings, poses, _ = skewed
     lengths, runs = leg_lengths(hexapod, *poses), np.arange(8) // 4

@@ -72,6 +72,7 @@ def test_samples_that_stand_count_once():
     np.testing.assert_array_equal(repeated.gain, found.gain)
 
 
+@pytest.mark.slow
 def test_data_that_do_not_tell_the_constants_are_refused_with_what_is_missing():
     def refused(match, fields, forces=None):
         with pytest.raises(CalibrationError, match=match):

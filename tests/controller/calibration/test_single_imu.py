@@ -56,6 +56,7 @@ def by_hand(ups=UPS, rest_s=2.0, turn_s=2.0, seed=0, model=RAW):
     return sampled, raw[:, 0, 0], raw[:, 1, 0], gain, -(gain @ imu["offset"][:2, 0, :, None])[..., 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_simulated_constants_are_recovered(seed):
     *data, gain, offset = by_hand(seed=seed)

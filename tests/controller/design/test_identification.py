@@ -132,6 +132,7 @@ def test_intervals_hold_with_noise_that_is_correlated(hexapod, commands, ideal, 
     assert worst(found, true) < 4.0 and 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.6
 
 
+@pytest.mark.slow
 def test_viscous_friction_goes_with_the_gain(hexapod, commands, ideal, true):
     names = ("drive.gain", "friction.viscous")
     mechanism = known(hexapod, true, *names)
@@ -253,6 +254,7 @@ def test_first_values_and_data_are_checked(hexapod, commands, ideal):
         identify_actuators(hexapod, IMU, given)
 
 
+@pytest.mark.slow
 def test_a_machine_unlike_its_model_is_told(hexapod, commands, ideal, true):
     """What remains is held against the noise at rest; here all joints are a centimetre off."""
     rest = np.tile(np.array(NOISES)[:, None, None], (1, 7, 3))

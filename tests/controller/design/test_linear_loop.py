@@ -31,6 +31,7 @@ def tilted(mechanism):
     return Pose(mechanism.home.position + [0.02, -0.01, 0.015], rotation_from_vector([0.1, -0.05, 0.15]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexapod", "6-3-II"])
 def test_the_open_loop_integrates_the_commands_into_the_estimated_lengths(name):
     """A small step of one command after the other: when the filters have settled, each estimated leg moves at that speed."""

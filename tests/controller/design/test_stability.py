@@ -51,6 +51,7 @@ def transfer_functions(gains):
     return [control.minreal(drive * pid, verbose=False) for drive in drives]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("values", GAINS)
 def test_the_margins_are_those_of_the_transfer_functions(values):
     found = margins(integrators(), settings(values))

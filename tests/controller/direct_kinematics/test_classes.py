@@ -118,6 +118,7 @@ def solve_sets(method, mechanism, positions, rotations, sets=SETS):
 # ----------------------------------------------------------------------------------------------------------- every class
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [(0,), pytest.param((1, 2), marks=pytest.mark.slow)])
 @every_class
 def test_every_method_gives_the_pose_from_all_legs_that_will_do_and_an_error_from_others(each, seeds):
@@ -145,6 +146,7 @@ def test_every_method_gives_the_pose_from_all_legs_that_will_do_and_an_error_fro
 THOROUGH = settings().max_examples > 1000
 
 
+@pytest.mark.slow
 @settings(max_examples=settings().max_examples if THOROUGH else 200, deadline=None, derandomize=not THOROUGH)
 @given(
     st.sampled_from(EVERY),
@@ -185,6 +187,7 @@ def ring(radius, count=6, first=0.0):
     return radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.15, 0.2, 0.4])
 @pytest.mark.parametrize("first", [0.0, np.pi / 6.0])
 def test_regular_hexagons_give_no_wrong_pose(radius, first):
@@ -259,6 +262,7 @@ def bent_out_of_plane(random, off):
     return base, platform, position, rotation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("approach", "method", "legs"),
     [

@@ -153,6 +153,7 @@ def design_pose(random, mechanism):
 # --------------------------------------------------------------------------------------------- noise-free poses come back
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, YAWS, TILTS, st.booleans())
 def test_every_set_of_measurements_gives_back_a_noise_free_pose(seed, yaw, tilt, coplanar):
@@ -181,6 +182,7 @@ def test_every_set_of_measurements_gives_back_a_noise_free_pose(seed, yaw, tilt,
     assert_pose(solution, position, rotation)
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, YAWS, TILTS)
 def test_legs_alone_give_back_the_pose_of_coplanar_platform_joints(seed, yaw, tilt):
@@ -361,6 +363,7 @@ def flat_mechanism(random, base_count, platform_count):
 # ------------------------------------------------------------------------------------------------------------ refinement
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", ["legs", "up", "normal", "both"])
 @pytest.mark.parametrize("legs", [range(6), range(5)])
 def test_the_solution_is_the_weighted_least_squares_minimum(hexapod, known, legs):
@@ -462,6 +465,7 @@ def test_a_covariance_is_symmetric_and_scales_with_the_variances(hexapod):
     assert (np.linalg.eigvalsh(fine.covariance) > 0.0).all()
 
 
+@pytest.mark.slow
 def test_the_noise_figures_of_the_design_hold(hexapod):
     """Design 5.3: 0.05 deg on each component of every leg and on roll and pitch, 1.5 deg on a magnetic yaw, 1500 poses."""
     random = np.random.default_rng(8)
@@ -733,6 +737,7 @@ def test_what_is_no_mechanism_option_or_number_is_refused_in_words(hexapod):
 # ----------------------------------------------------------------------------------------- joints that are coplanar but nearly
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("height", [1e-15, 1e-12, 1e-9, 1e-6, 2e-4, 2e-3])
 @pytest.mark.parametrize("refine", [True, False])
 def test_legs_alone_give_the_pose_of_joints_that_are_nearly_coplanar(hexapod, height, refine):

@@ -19,6 +19,7 @@ def fewest(mechanism):
     return {(need.platform, need.legs): need.fewest for need in required_lengths(mechanism)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_needs_as_many_lengths_as_equations_lack(name):
     """Six less two for each leg's IMU and those of the platform."""
@@ -66,6 +67,7 @@ def test_a_set_that_suffices_leads_gauss_newton_to_the_pose(imus, encoders, tilt
     assert (np.abs(fit.x - true).max() < 1e-5) == found
 
 
+@pytest.mark.slow
 def test_what_always_suffices_is_at_least_what_suffices_at_best():
     for number, each in enumerate(spatial_classes()[::6]):
         for need in required_lengths(draw_mechanism(each, np.random.default_rng(number))):

@@ -47,6 +47,7 @@ class Bench:
         return bool(self.pose["found"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "hexapod", "genhexkins", "planar-3rpr"])
 def test_from_home_it_finds_every_pose_of_the_workspace_with_its_twist(name):
     random, bench = np.random.default_rng(0), Bench(name)

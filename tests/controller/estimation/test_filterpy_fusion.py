@@ -57,6 +57,7 @@ class Twins:
         take_leg_sample(self.x, self.covariance, gyroscope, accelerometer, *variances, *self.scratch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "seed"),
     [(250.0, 2), *(pytest.param(rate, seed, marks=pytest.mark.slow) for rate, seed in ((1000.0, 1), (4000.0, 3)))],

@@ -155,6 +155,7 @@ def test_section_5_is_the_public_solvers_for_the_same_measurements(hexapod):
     np.testing.assert_array_equal(state["pose"]["information"], 0.0)
 
 
+@pytest.mark.slow
 def test_without_it_the_magnetometer_makes_no_difference(hexapod):
     read, states = noisy(hexapod), [np.zeros((), STATE), np.zeros((), STATE)]
     for _ in range(50):

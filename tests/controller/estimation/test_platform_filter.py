@@ -132,6 +132,7 @@ def test_a_direction_turns_exactly(rate, period):
     assert np.linalg.norm(turned) == pytest.approx(1.0, abs=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "seed"), [(0.05, 0), (0.1, 1), (0.15, 2)])
 def test_with_a_known_acceleration_it_is_the_kalman_filter_that_takes_the_rest_for_gravity(noise, seed):
     """Over three thousand steps, to a fifth of the standard deviations, with less noise than the assumed 0.3 m/s2."""
@@ -281,6 +282,7 @@ def test_a_clipped_rate_leaves_the_vertical_as_uncertain_as_a_constant_accelerat
     assert platform.state["clipped_for"] == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_what_a_clipped_rate_turns_the_vertical_is_forgotten_within_two_seconds_on_a_shaken_platform(seed):
     """A turn of half a second at up to 4.8 rad/s, of which a gyroscope shows 4 rad/s: 15 degrees are lost."""
@@ -321,6 +323,7 @@ def test_the_vertical_stays_unit_and_the_covariance_positive_definite_over_twent
     assert tilt_error(platform.vertical, rotations[-1]) < 1.0 * DEGREE
 
 
+@pytest.mark.slow
 def test_settled_errors_are_as_large_as_the_covariance_says():
     errors = []
     for seed in range(40):

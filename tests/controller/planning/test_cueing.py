@@ -77,6 +77,7 @@ def low(frequency):
     return control.tf([frequency], [1.0, frequency])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [2, 3])
 @pytest.mark.parametrize("kind", ["force x", "force y", "force z", "rate x", "rate y", "rate z"])
 def test_small_motions_are_those_of_the_transfer_functions(hexapod, kind, order):
@@ -131,6 +132,7 @@ def test_the_period_of_the_samples_does_not_matter(hexapod):
 # ------------------------------------------------------------------------------------------------------------------ physics
 
 
+@pytest.mark.slow
 @settings(max_examples=20)
 @given(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0))
 def test_what_lasts_is_felt_as_gravity_and_the_platform_comes_back(hexapod, along, across):
@@ -310,6 +312,7 @@ def check_stream(data):
             planner.follow(plan)
 
 
+@pytest.mark.slow
 @settings(max_examples=2)
 @given(st.data())
 def test_a_streamed_cue_is_never_refused_and_no_limit_is_left(data):

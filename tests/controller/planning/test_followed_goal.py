@@ -24,6 +24,7 @@ def coordinates_of(mechanism, pose):
     return np.concatenate([pose.position - mechanism.home.position, turn])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
 @pytest.mark.parametrize("seed", range(3))
 def test_it_goes_to_the_last_goal_smoothly_and_within_a_share_of_the_actuators_limits(name, seed):

@@ -156,6 +156,7 @@ def check_random_motion(mechanism, seed):
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0, *(pytest.param(first, marks=pytest.mark.slow) for first in range(20, 100, 20))])
 def test_random_motions_leave_no_limit(hexapod, first):
     assert sum(check_random_motion(hexapod, seed) for seed in range(first, first + 20)) >= 14
@@ -215,6 +216,7 @@ def test_a_line_takes_hardly_longer_than_its_slowest_leg_would_alone(hexapod):
         assert max(alone) * (1.0 - 1e-6) <= planned.duration < 1.25 * max(alone)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     st.lists(st.floats(-0.02, 0.02), min_size=3, max_size=3),
@@ -459,6 +461,7 @@ def check_time_scale(mechanism, seed):
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0, *(pytest.param(first, marks=pytest.mark.slow) for first in range(10, 40, 10))])
 def test_the_time_scale_that_would_pass_passes(hexapod, first):
     assert sum(check_time_scale(hexapod, seed) for seed in range(first, first + 10)) >= 7

@@ -269,6 +269,7 @@ def position_error(mechanism, target, duration):
     return np.sqrt(np.mean(np.sum((positions - wanted) ** 2, axis=1)))
 
 
+@pytest.mark.slow
 def test_a_recorded_motion_is_followed_within_a_fiftieth_of_a_millimetre(hexapod, motion_capture):
     assert position_error(hexapod, load_target(motion_capture, hexapod, 60.0), 60.0) <= 0.02e-3
 

@@ -93,6 +93,7 @@ def random_target(mechanism, random):
     return Target("random", times, home.position + moves[:, :3], rotations)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [25, pytest.param(1000, marks=pytest.mark.endurance)])
 def test_the_time_scale_passes_and_hardly_any_less_would(hexapod, count):
     random, slowed = np.random.default_rng(7), 0

@@ -59,6 +59,7 @@ def twin(segments, time):
     return np.array(rows)
 
 
+@pytest.mark.slow
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.floats(1e-4, 0.2))
 def test_length_rate_and_acceleration_are_those_of_the_segments_polynomial(seed, count, step):

@@ -128,6 +128,7 @@ def displacements(random, kind, count):
     return waves
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     [
@@ -160,6 +161,7 @@ def test_no_limit_is_left_whatever_comes(hexapod, kind, seed):
     assert (follower.pieces[-1][:, 1:] == 0.0).all()
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32 - 1))
 def test_each_plan_is_within_the_limits_to_its_end_and_begins_where_the_one_before_is(hexapod, seed):
     random = np.random.default_rng(seed)

@@ -323,6 +323,7 @@ def test_a_quaternion_off_unit_within_the_tolerance_is_normalised(hexapod, tmp_p
 # ------------------------------------------------------------------------------------------------------ between the samples
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5, 3.0, np.pi - 0.01, np.pi]))
 def test_between_samples_the_motion_is_smooth_and_never_swings_beyond_them(seed, start_angle):
@@ -402,6 +403,7 @@ def test_asking_for_poses_does_not_change_the_target(hexapod):
     assert target.times[1] == SAMPLE_PERIOD_S
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexapod", "6-3-I", "6-3-II", "6-4-I", "6-4-II", "6-5", "genhexkins"])
 def test_no_two_rests_near_home_are_alike(name):
     target = load_target("near-rests", load_spatial(name), 8 * REST_S)

@@ -65,6 +65,7 @@ def test_noise_of_a_standing_target_is_not_taken_for_motion(rate, seed):
     assert np.sqrt(np.mean(np.square(speeds))) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [21, 22])
 @pytest.mark.parametrize(("noise", "most"), [(0.0, 0.1e-3), (1e-5, 0.15e-3), (1e-4, 0.5e-3), (1e-3, 3e-3)])
 def test_a_moving_target_is_met_as_well_as_its_noise_allows(noise, most, seed):

@@ -229,6 +229,7 @@ def test_a_controlled_stop_ends_on_the_brakes(hexapod):
     assert (bench.mode, bench.request) == (Mode.STOPPED, Request.BRAKED)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.data())
 def test_whatever_drives_and_bus_say_nothing_moves_but_as_specified(hexapod, data):

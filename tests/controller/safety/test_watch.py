@@ -754,6 +754,7 @@ def test_a_motion_at_rest_ends_a_run_that_is_judged(both, mode, evidence, stops)
         assert state["safety"]["stop"]["cause"] == Cause.NONE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [0, 1])
 @pytest.mark.parametrize(
     ("sigmas", "change", "stops"),

@@ -261,6 +261,7 @@ def test_no_plan_for_a_stream_leaves_a_limit_of_the_pose(seed):
     assert np.linalg.norm(np.array(follower.pieces)[-1, :, 1]) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hexapod", "planar-3rpr"])
 def test_a_check_after_its_machine_code_was_loaded_compiles_none_of_it_for_other_types(name):
     """In a process of its own: kernels that other tests have called know other types, too."""

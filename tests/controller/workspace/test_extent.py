@@ -32,6 +32,7 @@ def moves_within(half_sizes, count, seed, ellipsoid):
     return points * half_sizes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [pytest.param("hexapod", marks=pytest.mark.slow), "planar-3rpr"])
 @pytest.mark.parametrize("find", [largest_box, largest_ellipsoid])
 def test_every_pose_of_the_largest_region_is_reached_and_a_larger_one_touches(name, find):

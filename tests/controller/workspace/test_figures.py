@@ -43,6 +43,7 @@ def first_outside(mechanism, poses, most):
     return brentq(excess, steps[k - 1], steps[k], xtol=1e-12)
 
 
+@pytest.mark.slow
 def test_reach_is_the_volume_that_straight_moves_cover(mechanism):
     """Against moves in random directions, each by steps: the mean of the cubes, with its standard error."""
     random, home = np.random.default_rng(0), mechanism.home

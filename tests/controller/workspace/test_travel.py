@@ -65,6 +65,7 @@ def _kept(mechanism: Mechanism, demands: Demands, row: int) -> bool:
     return bool(margins(mechanism, pose.position[None], pose.rotation[None], demands, workers=1).values.min() > 1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [

@@ -13,6 +13,7 @@ from plant.mechanism.classification import spatial_classes
 from tests.controller.leg_geometry import rotation_of
 
 
+@pytest.mark.slow
 def test_every_class_and_method_is_timed_and_cold_starts_are_ours(monkeypatch):
     few = {"_ROWS": 100, "_REPEATS": 1, "_ROUNDS": 3, "_BATCH_ROWS": 5000, "_MOTION_S": 0.2, "_COLD_STARTS": 60}
     for name, value in few.items():

@@ -41,6 +41,7 @@ def test_the_presets_keep_their_limits(name):
     assert within_drives(mechanism) is mechanism
 
 
+@pytest.mark.slow
 def test_drives_that_are_too_weak_for_all_legs_at_once_get_gentler_motions(weak):
     """The plant's own currents in the open loop are the witness."""
     mechanism = load_spatial(weak)

@@ -147,6 +147,7 @@ def test_every_step_says_what_will_happen_how_far_and_how_fast(plan) -> None:
         assert "mm and" in texts[name] and "250 mm/s at most" in texts[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

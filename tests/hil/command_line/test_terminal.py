@@ -54,6 +54,7 @@ def test_the_clock_of_the_bar_goes_on_when_more_functions_are_compiled_than_expe
     assert {"0:00:01", "0:00:02"} <= beyond
 
 
+@pytest.mark.slow
 def test_without_a_terminal_a_line_tells_now_and_then_that_it_goes_on():
     run = subprocess.run([sys.executable, "-c", COMPILES.format(quiet=1.0)], capture_output=True, text=True, check=True)
     told = re.findall(r"^compiling function (\d+) of about (\d+) ", run.stderr, re.MULTILINE)

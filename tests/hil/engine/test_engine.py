@@ -55,6 +55,7 @@ def difference(much, less, least=0.0):
     return much - less - least
 
 
+@pytest.mark.slow
 def test_results_come_in_the_order_of_the_items_whatever_their_times(engine):
     delays, shares = [0.3, 0.2, 0.1, 0.05, 0.0, 0.0], []
     results = engine.map(late, delays, shares.append)
@@ -65,6 +66,7 @@ def test_results_come_in_the_order_of_the_items_whatever_their_times(engine):
     assert engine.map(late, []) == []
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=20)
 @given(items=st.lists(st.floats() | st.text() | st.tuples(st.integers(), st.booleans()), max_size=10))
 def test_every_item_has_one_result_in_its_place(engine, items):

@@ -17,6 +17,7 @@ def run_matrix(seeds, cases):
     return outcomes_of(cases, run_trials(trials_of(cases, seeds)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.endurance)])
 @pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
 def test_the_reaction_is_the_specified_one(case, seed):
@@ -64,6 +65,7 @@ def test_with_encoders_an_error_before_a_fault_is_told_is_found():
     assert any("off before it was told, and 1 and 0.3 are allowed" in each for each in findings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("case", "finding"),
     [
@@ -95,6 +97,7 @@ def test_a_case_may_disturb_imus_over_the_bus():
         assert outcome.findings == []
 
 
+@pytest.mark.slow
 def test_a_case_comes_out_the_same_every_time():
     first, again = (run_matrix(2, CASES[3:4])[0].summary() for _ in range(2))
     assert first == again
@@ -130,6 +133,7 @@ def test_the_table_with_encoders_has_the_fusions_side_by_side():
     assert rows == [["frozen", "compiled / whole", "11, 12 / 10, 10", "0.40, 0.50 / 0.10, 0.10", "0.09, 0.11 / 0.03, 0.03"]]
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_table_and_its_status_says_whether_all_is_well(capsys, tmp_path):
     emergency = ("--seeds", "1", "--only", "emergency", "--workers", "1")
     assert main(["faults", *emergency, "--markdown", "--json", str(tmp_path / "x.json")]) == 0

@@ -48,6 +48,7 @@ def test_a_share_of_the_cycles_is_late_on_every_link_and_the_same_ones_again(lin
     assert (run(row.drawn(3, "compiled"))[0]["missed"] > 0).tolist() != (records["missed"] > 0).tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fusion", "seed"),
     [("whole", 0), *(pytest.param(*each, marks=pytest.mark.slow) for each in (("compiled", 0), ("whole", 1)))],

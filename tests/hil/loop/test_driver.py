@@ -81,6 +81,7 @@ def test_the_stages_that_are_timed_are_the_cycle():
         assert len(STAGES) == written(loop)["stage_ns"].shape[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
 def test_missed_periods_hardly_raise_the_protection_level(fusion):
     """The evidence lasts over missed periods: beginning anew after each would raise the level fivefold at times."""

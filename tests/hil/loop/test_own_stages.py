@@ -166,6 +166,7 @@ def test_a_command_is_asked_for_while_the_drives_follow():
     assert len(asked) == np.count_nonzero(records["mode"] == Mode.RUNNING) < len(records)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stages", "said"),
     [

@@ -27,6 +27,7 @@ def config(**changes):
     return SimulationConfig(**{"mechanism": RIG, "duration": 3.0, **changes})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_a_circle_is_followed_with_low_cost_imus(seed):
     result = simulate(config(duration=8.0, seed=seed))

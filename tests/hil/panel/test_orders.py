@@ -77,6 +77,7 @@ def rests_at(state, position):
     return not told["moving"] and np.abs(np.subtract(told["commanded"]["position"], position)).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_a_button_that_a_browser_without_control_lets_go_does_not_end_anothers_jog(hexapod):
     button = "Hold to jog +"
     with operated(hexapod, 2) as (run, (first, second), state):

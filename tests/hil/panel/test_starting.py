@@ -85,6 +85,7 @@ def test_numbers_that_no_run_can_have_are_refused_before_one_is_started(server, 
         form.options()
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_begin_says_why(server, capfd):
     run = StartedRun(["--mechanism", "nothing"])
     while run.status is None:

@@ -27,6 +27,7 @@ def result_of(objectives, tmp_path):
     return optimise(design, tmp_path / "results", InOneProcess())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "objectives",
     [

@@ -189,10 +189,12 @@ def test_the_legs_are_coloured_by_what_the_menu_names(page, traces, result, fram
         assert buttons[label] == [{"visible": [each == number for each in tubes]}, tubes]
 
 
+@pytest.mark.slow
 def test_a_browser_draws_every_figure_without_an_error(report):
     draw_in_browser(report, len(FIGURES))
 
 
+@pytest.mark.slow
 def test_names_are_escaped_and_a_stop_is_told(result, tmp_path):
     path = tmp_path / "report.html"
     config = replace(result.config, duration=2.0)
@@ -202,6 +204,7 @@ def test_names_are_escaped_and_a_stop_is_told(result, tmp_path):
     assert "2 s, stopped after 1.000 s" in header
 
 
+@pytest.mark.slow
 def test_a_file_that_cannot_be_written_is_refused(result, tmp_path):
     (tmp_path / "folder").mkdir()
     for path in (tmp_path / "missing" / "report.html", tmp_path / "folder"):

@@ -62,6 +62,7 @@ def written(result, folder):
     return path, path.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_every_part_is_there_once_and_drawn(crossed, tmp_path):
     path, page = written(crossed, tmp_path)
     assert figures_in(page) == ["distributions", "effects0", "effects1", "pairs"]

@@ -37,6 +37,7 @@ def design_of(name, count):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "count"), [pytest.param("hexapod", 4, marks=pytest.mark.slow), ("planar-3rpr", 3), ("hexapod", 0)]
 )

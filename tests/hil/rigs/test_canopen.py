@@ -139,6 +139,7 @@ def run(rig, cycles, command=None, request=ENABLED, until=None):
     return feedback, statuses
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fd", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_it_runs_from_open_to_close(fd):
     machine = Kinematic()
@@ -175,6 +176,7 @@ def test_it_runs_from_open_to_close(fd):
         rig.quick_stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fd", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_drives_tell_what_their_encoders_read_if_they_are_asked(fd):
     machine, counts = Kinematic(), 65536 / 0.005
@@ -287,6 +289,7 @@ def test_nodes_refuse_a_mapping_that_they_do_not_have():
         rig.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes, code",
     [({"controller": {"heartbeat_timeout": 0.2}}, HEARTBEAT_LOST), ({"drives": {"command_timeout": 0.2}}, PDO_LOST)],
@@ -344,6 +347,7 @@ def test_a_drive_without_power_is_off():
         assert feedback["drive"][1] == OFF
 
 
+@pytest.mark.slow
 def test_a_silent_drive_is_off_and_a_silent_imu_stands():
     muted = set()
 
@@ -367,6 +371,7 @@ def test_a_silent_drive_is_off_and_a_silent_imu_stands():
         assert feedback["sequence"][1] >= before["sequence"][1] + 55
 
 
+@pytest.mark.slow
 def test_a_leg_that_leaves_operation_stops():
     machine = Kinematic()
     with armed(settings(), machine) as (rig, _):
@@ -378,6 +383,7 @@ def test_a_leg_that_leaves_operation_stops():
         np.testing.assert_array_equal(machine.velocity, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fd", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_late_and_double_frames_are_refused_and_counted(fd):
     faults = Counter()
@@ -455,6 +461,7 @@ def test_commands_that_are_not_numbers_are_zero():
 FRAMES = 500_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fd", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_the_decoder_takes_anything(fd):
     config = settings(bus={"fd": fd})
@@ -503,6 +510,7 @@ def test_nodes_take_anything():
     assert (machine.request == BRAKED).all() and (machine.length == 0.0).all()
 
 
+@pytest.mark.slow
 def test_it_can_be_opened_again():
     with serving(config := settings()):
         rig = CanopenRig(config, PERIOD)
@@ -630,6 +638,7 @@ def test_a_multicast_bus_without_hops_hears_the_loopback_alone():
         assert [message and message.arbitration_id for message in (other.recv(0.5), other.recv(0.05))] == [0x123, None]
 
 
+@pytest.mark.slow
 def test_two_processes_by_multicast():
     patient = {"controller": {"heartbeat_timeout": 1.0}, "drives": {"command_timeout": 1.0, "silence": 1.0}}
     config = canopen_settings(bus={"port": 43_217}, **patient)

@@ -66,6 +66,7 @@ def test_drives_follow_and_imus_sample_in_each_cycle(made):
     np.testing.assert_allclose(after["truth"][7:13] - before["truth"][7:13], 99 * PERIOD * 0.05, rtol=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fd", [True, False])
 def test_encoders_follow_the_legs(made, fd):
     rig = made("encoder-jumps:4,size_mm=2,at=0.1", fd=fd, lengths="ideal")
@@ -125,6 +126,7 @@ def moving(made):
     return make
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fd", "lengths", "signs"),
     # Every two of these choices meet once.
@@ -174,6 +176,7 @@ def test_after_missed_periods_nothing_jumps_and_the_motion_is_missing(moving):
     np.testing.assert_allclose(at_rest(rig, 100) - first, 1.3 * STEP, atol=5e-6)
 
 
+@pytest.mark.slow
 def test_lost_frames_cost_no_way_and_no_jump(moving):
     """Of commands and answers a fifth is lost; the target has gone on, and the drive makes up for it within its limit."""
     rig, first = moving("bus-drops,size=0.2,at=0.1", lengths="ideal")
@@ -184,6 +187,7 @@ def test_lost_frames_cost_no_way_and_no_jump(moving):
     np.testing.assert_allclose(at_rest(rig, 100) - first, 3.0 * STEP, atol=5e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [BRAKED, QUICK_STOP])
 def test_a_drive_that_is_enabled_again_begins_where_it_is(moving, stop):
     rig, _ = moving(lengths="ideal")
@@ -219,6 +223,7 @@ def test_while_it_stands_the_target_is_where_the_drive_is(moving):
     assert [drive.target_position for drive in rig.nodes.drives] == [sent[k] for k in range(6)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "code"),
     [

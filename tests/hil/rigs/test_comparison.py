@@ -53,6 +53,7 @@ def examined(**wrong):
     return examine_rig(make, PERIOD, mechanism=HEXAPOD).findings, rigs[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rig",
     [

@@ -56,6 +56,7 @@ def refused_from(most):
     return change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change, message",
     [
@@ -88,6 +89,7 @@ def test_what_an_exchange_at_rest_does_wrong_is_told(change, message):
     assert check_rig(lambda: Changed(change), PERIOD, moving=False) == [message]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [
@@ -115,6 +117,7 @@ def scaled(leg, factor):
     return change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "leg, factor, found", [(3, 1.4, False), (3, 0.7, False), (3, 1.9, True), (0, 0.3, True), (5, -1.0, True)]
 )
@@ -179,6 +182,7 @@ def test_what_is_asked_of_a_rig_that_may_move():
     np.testing.assert_allclose([after[0] - before[0] for before, after in pairwise(asked)], 1e9 * PERIOD, atol=1e5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "delay, sound", [(0, True), (0.05, True), (0.0501, False), (-0.001, False), ("5 ms", False), (float("nan"), False)]
 )

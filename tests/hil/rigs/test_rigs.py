@@ -126,6 +126,7 @@ def test_the_plant_keeps_the_contract():
     assert check_rig(Plant, PERIOD, mechanism=HEXAPOD) == []
 
 
+@pytest.mark.slow
 @on_virtual_time
 def test_the_template_keeps_the_contract():
     found = examine_rig(template, PERIOD, beyond=10.0, absent=lambda: template("nowhere"), mechanism=HEXAPOD)
@@ -383,6 +384,7 @@ class DelaysForLong(TemplateRig):
         self.command_delay = 3.0
 
 
+@pytest.mark.slow
 @on_virtual_time
 @pytest.mark.parametrize(
     "kind, clause, message",
@@ -487,6 +489,7 @@ def replayed(path, rig=None, **changes):
         return cause, loop.records[: int(loop.state["time"]["cycle"])].copy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faults", "changes"),
     [

@@ -299,6 +299,7 @@ def test_quick_stop_and_close_can_come_at_any_time(address):
     rig.quick_stop()
 
 
+@pytest.mark.slow
 def test_a_rig_that_is_not_there_or_too_impatient_is_told(address):
     with pytest.raises(RigError, match="no rig answers"):
         UdpRig(f"127.0.0.1:{free_port()}", PERIOD).open()

@@ -158,6 +158,7 @@ def test_a_replay_is_the_run_bit_for_bit(recorded):
     assert process.returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fusion", [pytest.param("compiled", marks=pytest.mark.slow), "whole"])
 def test_a_replay_has_the_added_sensors(fusion, tmp_path):
     """Lengths and the base's IMU are as much part of a recording as the other IMUs."""
@@ -244,6 +245,7 @@ def test_a_file_that_was_cut_short_anywhere_is_read_up_to_there_and_can_be_mende
     assert most > 0.5 * len(whole.records)
 
 
+@pytest.mark.slow
 def test_a_rig_in_python_runs_in_the_same_executive(tmp_path):
     path = tmp_path / "python.mcap"
     config = SimulationConfig(target="circle", duration=0.5, rate=100.0)
@@ -451,6 +453,7 @@ def test_the_loop_is_alone_in_its_process_with_what_it_was_granted(tmp_path):
         process.communicate(timeout=30.0)
 
 
+@pytest.mark.slow
 def test_the_process_of_the_loop_imports_nothing_heavy():
     code = (
         "import sys, hil.runs.executive; print([name for name in "
@@ -459,6 +462,7 @@ def test_the_process_of_the_loop_imports_nothing_heavy():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not ROOT, reason="needs privileges")
 def test_what_was_taken_is_given_back():
     before = (os.sched_getscheduler(0), os.sched_getparam(0).sched_priority, os.sched_getaffinity(0), locked())
@@ -559,6 +563,7 @@ def test_what_is_over_the_budget_is_named(recorded):
     assert over_budget(timing) == ["compute p50 13.0 us, budget 12 us"]
 
 
+@pytest.mark.slow
 def test_a_run_that_cannot_go_on_says_why_and_keeps_its_recording(tmp_path):
     path = tmp_path / "raw.mcap"
     with pytest.raises(
@@ -597,6 +602,7 @@ def test_when_the_supervisor_is_killed_before_the_start_nothing_stays(tmp_path):
     wait_for(lambda: gone(*others))
 
 
+@pytest.mark.slow
 def test_a_signal_before_the_start_ends_it_at_once():
     process = gough("run", "--duration", 60, "--rate", 500)
     wait_for(lambda: any(is_ours(child) for child in children(process.pid)) or process.poll() is not None)
@@ -800,6 +806,7 @@ def test_damage_never_passes_for_a_difference(recorded, tmp_path):
         assert result.different is None
 
 
+@pytest.mark.slow
 def test_no_file_is_named_twice(recorded, tmp_path):
     _, path = recorded
     for arguments in (["replay", path, "--json", path], ["run", "--json", tmp_path / "x", "--record", tmp_path / "x"]):
@@ -809,6 +816,7 @@ def test_no_file_is_named_twice(recorded, tmp_path):
     assert read(path).complete
 
 
+@pytest.mark.slow
 def test_a_terminal_shows_the_run_as_it_goes():
     main, terminal = pty.openpty()
     try:

@@ -79,6 +79,7 @@ def test_low_cost_imus_follow_on_a_foreign_fmu(foreign_fmu, binding):
     assert moved.max() > 10.0 * MM
 
 
+@pytest.mark.slow
 def test_without_the_truth_the_loop_follows_all_the_same_and_says_so(foreign_fmu, binding, bare, tmp_path):
     figures, report = tmp_path / "figures.json", tmp_path / "report.html"
     plant = ("--plant", foreign_fmu, "--target", "sines", "--duration", 1, "--json", figures)
@@ -261,6 +262,7 @@ def renamed(path, fmu, *names):
     return edited(fmu, path, *((f'name="{name}"', f'name="my.{name}"') for name in names))
 
 
+@pytest.mark.slow
 def test_an_fmu_with_the_signals_alone_keeps_its_parameters_and_one_with_some_of_them_is_refused(fmu_path, hexapod, tmp_path):
     some, none = tmp_path / "some.fmu", tmp_path / "none.fmu"
     renamed(some, fmu_path, "brake.force", "gravity")

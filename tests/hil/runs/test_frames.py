@@ -276,6 +276,7 @@ def test_an_emulator_starts_where_the_tool_begins(cell, monkeypatch):
     np.testing.assert_allclose(whole(started[0].rotation, started[0].position), expected, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_simulate_prints_and_writes_the_errors_of_the_tool(cell, tmp_path, capsys):
     pytest.importorskip("plotly")
     figures, report = tmp_path / "run.json", tmp_path / "run.html"

@@ -114,6 +114,7 @@ def test_lost_answers_move_neither_the_pose_nor_the_commands(changes):
     assert steps.max() < 0.1e-3 and np.abs(np.diff(moving["command"], axis=0)).max() < 8e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lengths", "fault"), [("incremental", "encoder-jumps:4,size_mm=3,at=3"), ("absolute", "encoder-frozen:4,at=3,for=0.5")]
 )

@@ -29,6 +29,7 @@ def lasts(text):
     return replace(AT_SEA, faults=(*SEA, text))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
 def test_with_ideal_sensors_the_pose_on_a_base_that_moves_is_exact(fusion):
     """As with a base at rest, once the base no longer begins to move within a tenth of a second."""
@@ -39,6 +40,7 @@ def test_with_ideal_sensors_the_pose_on_a_base_that_moves_is_exact(fusion):
     assert (moved < still + (5e-3, 1e-3)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("fusion", "most"), [("compiled", (1.0, 0.2)), ("whole", (0.5, 0.1))])
 def test_with_calibrated_imus_the_pose_on_a_base_that_moves_is_as_good_as_at_rest(fusion, most, seed):

@@ -337,6 +337,7 @@ def test_a_planar_mechanism_moves_in_its_plane_alone():
         assert not run.references()[:, 3:].any() and run.cause[0] == Cause.NONE
 
 
+@pytest.mark.slow
 def test_a_goal_that_changes_is_followed_without_a_rest_and_within_all_limits(hexapod):
     home = hexapod.home.position
     with running(hexapod) as run, run.operator() as operator:
@@ -374,6 +375,7 @@ def test_a_goal_that_changes_is_followed_without_a_rest_and_within_all_limits(he
         assert run.cause[0] == Cause.NONE
 
 
+@pytest.mark.slow
 def test_a_flood_of_requests_holds_up_neither_the_platform_nor_an_observer(hexapod):
     """A thousand orders at once, of which each takes a while; channel and clients take turns in one process."""
     with running(hexapod, serve=False) as run:
@@ -487,6 +489,7 @@ def listen_to_the_newest(observer):
     assert 0.1 < time.monotonic() - began < 30.0
 
 
+@pytest.mark.slow
 def test_one_operator_at_a_time_and_observers_who_give_no_orders(hexapod):
     with running(hexapod) as run, run.operator(name="panel") as operator:
         with pytest.raises(ChannelError, match="panel operates this run, and only one may") as refused:

@@ -19,6 +19,7 @@ def stopped(**changes):
     return ended.value.result, str(ended.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [

@@ -269,6 +269,7 @@ def test_filterpy_closes_the_same_loop(monkeypatch):
     np.testing.assert_allclose(filterpy["command"], compiled["command"], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("imus", [(0, 1, 2, 3, 4, 5), (0, 1, 2, 6), (0, 1, 2, 3, 4), (1, 2, 3, 4, 5, 6)])
 def test_any_imus_that_determine_the_pose_close_the_loop(imus):
     result = simulate(SimulationConfig(target="circle", duration=3.0, imus=imus))

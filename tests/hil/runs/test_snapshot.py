@@ -266,6 +266,7 @@ def test_a_time_without_a_file_is_refused(capsys: pytest.CaptureFixture[str]) ->
         simulate(SimulationConfig(fusion="filterpy", duration=0.5), save_at=0.2)
 
 
+@pytest.mark.slow
 def test_a_snapshot_goes_on_in_another_process_and_with_a_foreign_fmu(foreign_fmu: Path, tmp_path: Path) -> None:
     (tmp_path / "foreign.toml").write_text(BINDING + TRUTH)
     config = SimulationConfig(duration=0.6, plant=str(foreign_fmu), binding=str(tmp_path / "foreign.toml"))

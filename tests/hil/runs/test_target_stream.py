@@ -144,6 +144,7 @@ def following_error(mechanism, target, references):
     return min(np.sqrt(np.mean((ours[:2300] - theirs[:2300]) ** 2)) for ours, theirs in pairs)
 
 
+@pytest.mark.slow
 def test_a_streamed_motion_is_followed_and_ends_at_rest_when_the_stream_does(hexapod):
     # A busy machine may hold up each of the three processes; a lasting fault of the code would show in every try.
     for _ in range(4):

@@ -47,6 +47,7 @@ def check_design(name, poses, position=False, delay=0.0):
             check_margins(loop, found, {fastest, weakest})
 
 
+@pytest.mark.slow
 def test_a_loop_on_the_fmu_has_the_crossover_and_the_margins_of_the_linear_one():
     """The planar preset's gains, which ring: its crossover and margins are far from those of exact lengths."""
     mechanism = load_in_space("planar-3rpr")

@@ -80,11 +80,13 @@ def test_the_command_prints_writes_and_draws(tmp_path, capsys):
     assert figures_in(page) == ["graph", "mechanism", "conditioning"]
 
 
+@pytest.mark.slow
 def test_the_report_of_a_planar_mechanism_is_drawn(tmp_path):
     write_report(describe(load_mechanism("planar-3rpr")), tmp_path / "report.html")
     assert "2 assembly modes" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_what_is_in_no_class_is_refused():
     star = PlanarMechanism.from_legs([[0, 0], [1, 0], [0, 1]], [[0, 0], [0.1, 0], [0, 0.1]])
     assert describe(star).mechanism_class.label == "planar n-3.1"

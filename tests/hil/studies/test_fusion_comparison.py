@@ -40,6 +40,7 @@ def test_covariances_are_of_the_size_of_the_errors(figures):
     assert figures["section 5, magnetometer"]["nees"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [

@@ -68,6 +68,7 @@ def without_times(figures):
     return [without_times(each) for each in figures] if isinstance(figures, list | tuple) else figures
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "study",
     [

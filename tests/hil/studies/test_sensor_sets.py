@@ -25,6 +25,7 @@ def least_of(name):
     return next(sensors for sensors in SETS if sensors.label == paper_set(classify(load_spatial(name))))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FEW)
 def test_every_type_follows_sines_with_the_least_sensors_and_with_all(name):
     least, everything = evaluate_sensor_sets([name], (least_of(name), SETS[-1]), duration=3.0)
@@ -52,6 +53,7 @@ def test_the_papers_least_sensors_are_those_of_its_sections():
         assert (least[name].legs, least[name].magnetometer, least[name].fusions) == (2, True, ("section-5",))
 
 
+@pytest.mark.slow
 def test_two_legs_that_meet_need_the_heading_in_the_whole_mechanism_filter():
     """They do not tell the yaw: without its magnetometer the filter is 1.6 deg off after 10 s, by the gyroscope's bias."""
     two = next(sensors for sensors in SETS if sensors.label == "2 legs + yaw")
@@ -72,6 +74,7 @@ def test_the_documented_table_has_every_set():
     assert [(row[0], row[1].removesuffix(" *")) for row in rows] == [(name, each.label) for name in MECHANISMS for each in SETS]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FEW)
 def test_the_documented_sets_have_their_imus_and_conditioning(name):
     mechanism = load_spatial(name)

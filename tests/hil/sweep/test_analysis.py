@@ -98,6 +98,7 @@ def test_runs_of_the_same_seed_are_no_independent_runs(seeds, cells, common):
         assert np.mean(naive) < 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seeds", [2, *(pytest.param(seeds, marks=pytest.mark.slow) for seeds in (3, 4, 5))])
 @pytest.mark.parametrize("common", [0.0, 0.5, 0.9])
 def test_with_few_seeds_no_end_of_a_quantile_promises_more_than_it_holds(seeds, common):
@@ -209,6 +210,7 @@ def ranges(*names):
     return tuple(Factor(name, (), -PI, PI) for name in names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_sobol_indices_of_ishigami(seed):
     study = study_of(*ranges("x1", "x2", "x3"), method="saltelli", count=2048, seed=seed)

@@ -289,6 +289,7 @@ def test_a_search_that_finds_nothing_writes_its_figures(tmp_path):
     assert json.loads((tmp_path / "one.json").read_text())["trials"] == {"run": 0, "given up": 0, "refused": 20}
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_mechanism(tmp_path):
     (tmp_path / "shape.toml").write_text(
         "[vary]\ngeometry.platform_radius = { from = 0.16, to = 0.24 }\n"

@@ -155,6 +155,7 @@ def test_a_study_that_grows_by_a_factor_has_its_values_in_the_rows_that_are_ther
     )
 
 
+@pytest.mark.slow
 def test_factors_and_figures_of_other_studies_are_no_figures_of_this_one(tmp_path: Path) -> None:
     many = (
         SEEDS,

@@ -73,6 +73,7 @@ def energy_beyond_work(plant: FmuPlant, intervals: int) -> tuple[float, dict[str
     return energy() - before - sum(work.values()), work
 
 
+@pytest.mark.slow
 def test_energy_changes_by_the_work_of_all_forces(make_plant: MakePlant) -> None:
     gaps = []
     for intervals in (1, 2, 4, 8):
@@ -99,6 +100,7 @@ def test_an_end_stop_gives_back_no_more_than_it_took(make_plant: MakePlant) -> N
     assert kinetic[-100:].max() < 0.9 * thrown
 
 
+@pytest.mark.slow
 def test_end_stops_at_full_command_win_no_energy(make_plant: MakePlant) -> None:
     """Up and down into the stops at full speed: they take energy and return less, and no energy comes from elsewhere."""
     plant = make_plant({"substep": 1e-4})

@@ -212,6 +212,7 @@ def integrator(dynamics: Dynamics, p: Values, step: float) -> Callable[[Array, A
     return advance
 
 
+@pytest.mark.slow
 def test_energy_changes_by_the_work_of_all_forces(dynamics: Dynamics, rig: Mechanism) -> None:
     """0.3 s of sines as commands and a wrench, with brakes that fall in: Simpson's rule over every pair of steps."""
     p = rig.plant_parameters()

@@ -162,6 +162,7 @@ def forces_on_legs(p: Values, forces: dict[str, tuple[Array, Array]]) -> tuple[A
 MOVING = pytest.mark.parametrize("moving", [0.0, 1.0], ids=["base at rest", "base moves"])
 
 
+@pytest.mark.slow
 @MOVING
 @pytest.mark.parametrize("seed", range(20))
 def test_the_equations_of_motion_agree_with_explicit_bodies(

@@ -11,11 +11,13 @@ from plant.fmu.check import check_fmu, platforms_of
 from tests.plant.fmu.foreign import edited
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fixture", ["foreign_fmu", "foreign_fmu_3"])
 def test_foreign_fmus_keep_their_promises(fixture: str, request: pytest.FixtureRequest) -> None:
     assert [check.problems for check in check_fmu(request.getfixturevalue(fixture))] == [(), (), (), None]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "finding"), [(3, "a step failed: servo 3 is at 91.5 degrees after a while"), (99, "crashed with signal 11")]
 )

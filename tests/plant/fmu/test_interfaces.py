@@ -363,6 +363,7 @@ KNOWNS = [variable.name for variable in (*SPATIAL.states, *SPATIAL.inputs) if no
 UNKNOWNS = [variable.name for variable in (*LAYOUT.rates, *SPATIAL.outputs)]
 
 
+@pytest.mark.slow
 def test_directional_derivatives_are_casadis_own_jacobians(fmu_path: Path, hexapod: Mechanism) -> None:
     import casadi as ca
 
@@ -568,6 +569,7 @@ def test_the_quaternion_of_model_exchange_returns_to_unit_length(fmu_path: Path)
 # ---- trying an FMU ----
 
 
+@pytest.mark.slow
 def test_an_fmu_that_does_not_keep_its_promises_is_found_out(foreign_fmu: Path, fmu_path: Path, tmp_path: Path) -> None:
     """A foreign one has no derivatives to try; one whose binary is of another build cannot be tried."""
     found = {check.name: check.problems for check in check_fmu(foreign_fmu)}

@@ -232,6 +232,7 @@ def run_at_random(plant: FmuPlant, random: Generator, sweep: Sweep) -> tuple[Arr
     return np.array(gaps), moved
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.25, pytest.param(1.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("sweep", SWEEPS, ids=lambda sweep: sweep.model.preset)
 def test_random_mechanisms_run_without_energy_from_nowhere_or_are_refused(sweep: Sweep, share: float) -> None:

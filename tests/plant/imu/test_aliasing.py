@@ -134,6 +134,7 @@ def test_conversions_are_spared_while_nothing_shakes() -> None:
     np.testing.assert_allclose(shaken[215:, 2], still[215:, 2], atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("period", [0.001, 0.004, 0.008])
 @pytest.mark.parametrize("kind", ["gyroscope", "accelerometer"])
 def test_the_noise_of_spared_conversions_has_the_same_density(kind: str, period: float) -> None:

@@ -178,6 +178,7 @@ def test_parts_have_the_figures_of_their_data_sheets() -> None:
     assert load_imu("icm20948").magnetometer.resolution == 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", PARTS)
 def test_the_loop_runs_with_each_part(part: str) -> None:
     """Calibrated and nominal ones follow to a millimetre; of a raw one the readings alone are looked at."""

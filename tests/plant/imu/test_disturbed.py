@@ -78,6 +78,7 @@ def test_vibration_without_a_low_pass_appears_at_its_alias_with_its_whole_amplit
     assert np.abs(read).max() <= G * (1.0 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2, 4])
 @pytest.mark.parametrize("frequency", [90.0, 700.0, 999.9])
 def test_oversampling_weighs_the_alias_as_the_low_pass_does(order: int, frequency: float) -> None:

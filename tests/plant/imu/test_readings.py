@@ -244,6 +244,7 @@ MPU = (radians(20.0), radians(20.0), 50.0 * MILLI_G, 80.0 * MILLI_G)
 CALIBRATED = (radians(0.2), radians(0.2), MILLI_G, MILLI_G)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "bounds"), [("mpu9150", MPU), ("mpu9150-calibrated", CALIBRATED), ("icm42688", CALIBRATED)])
 def test_biases_of_a_preset_have_the_magnitude_of_its_data_sheet(name: str, bounds: tuple[float, ...]) -> None:
     offsets = np.array([probe(load_imu(name), seed)[1] for seed in range(60)])
@@ -260,6 +261,7 @@ def test_biases_of_a_preset_have_the_magnitude_of_its_data_sheet(name: str, boun
     np.testing.assert_allclose(np.linalg.norm(offsets[:, MAGNETOMETER], axis=-1), hard_iron, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "gyroscope_scale", "accelerometer_scale", "cross_axis"),
     [("mpu9150", 0.03, 0.03, 0.02), ("mpu9150-calibrated", 0.0, 1e-3, 0.0), ("icm42688", 0.0, 1e-3, 0.0)],

@@ -52,6 +52,7 @@ def response(kind, t):
     return decay * (np.cos(w * t) - np.sin(w * t) / (w * SLOW_S)) if kind == "step" else decay * np.sin(w * t) / w
 
 
+@pytest.mark.slow
 @settings(max_examples=10)
 @given(seed=st.integers(0, 10**6), kind=st.sampled_from(["step", "ramp"]), missed=st.sampled_from([0, 3]))
 def test_an_estimate_that_leaves_what_is_commanded_is_seen_and_fades_as_a_second_order_filter_has_it(seed, kind, missed):
@@ -149,6 +150,7 @@ def errors_and_levels(records):
     return np.linalg.norm(errors.reshape(-1, 2, 3), axis=2), records["protection"].astype(float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
 @pytest.mark.parametrize(
     "name", ["all gyroscopes 0.5 deg/s about x at once", "all gyroscopes swing by 0.5 deg/s about x, 0.2 Hz"]
@@ -161,6 +163,7 @@ def test_the_level_covers_what_all_imus_share_before_it_is_told(name, fusion):
     assert (errors <= levels).all(axis=1).mean() > 0.99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setting", ["motor.resistance=0.72", "friction.coulomb=30", "friction.coulomb=0", "payload.mass=20"])
 def test_drives_and_loads_that_are_not_as_the_file_says_raise_the_level_by_millimetres(setting):
     config = SimulationConfig(duration=8.0, seed=5)

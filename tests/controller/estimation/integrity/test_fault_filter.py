@@ -30,6 +30,7 @@ def faults_of(state, known):
 KNOWN = np.tile(np.repeat([0.01, 0.1], 3), 7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["static", "0.5", "mixed"])
 def test_without_a_fault_what_is_found_is_as_small_as_it_claims(kind):
     squares = []
@@ -149,6 +150,7 @@ def gaps(lost, seed, apart=(60, 160)):
     return {int(end): lost for end in ends if end < 900}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["static", "0.5", "mixed"])
 @pytest.mark.parametrize("lost", [1, 3, 9])
 def test_what_was_read_before_a_missed_period_still_counts(kind, lost):

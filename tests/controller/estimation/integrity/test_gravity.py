@@ -111,6 +111,7 @@ def test_each_motion_has_its_own_reference():
     assert s["drifted"][0] < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("biased", [0.0, 0.015])
 def test_an_estimate_that_creeps_away_is_seen_and_constant_errors_are_not(biased):
     """A hexapod in motion; the estimate creeps by 3 mm and 6 mrad from the third second on, or stays."""
@@ -140,6 +141,7 @@ def test_an_estimate_that_creeps_away_is_seen_and_constant_errors_are_not(biased
             assert (late < usual).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
 def test_the_level_covers_gyroscopes_that_drift_so_slowly_that_nothing_is_told(fusion):
     (row,) = (row for row in all_rows() if row.name == "all gyroscopes drift by 0.005 deg/s per second about x")

@@ -108,6 +108,7 @@ FAULTY = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTY)
 def test_what_comes_up_is_explained_by_its_own_hypothesis(name):
     expected, spoil = FAULTY[name]
@@ -126,6 +127,7 @@ def test_what_comes_up_is_explained_by_its_own_hypothesis(name):
     assert found["all_evidence"] >= found["best_evidence"]
 
 
+@pytest.mark.slow
 def test_sound_readings_are_no_evidence():
     worst = 0.0
     for seed, kind in enumerate(("static", "0.2", "1", "mixed")):

@@ -185,6 +185,7 @@ def test_sound_accelerometers_read_the_motion_of_the_gyroscopes(kind):
     assert s["parity"]["steady"] < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("imu", [0, 5, 6, None])
 @pytest.mark.parametrize("size", [0.5, 1.5])
 def test_a_force_that_is_no_motion_is_known_in_the_second_window_of_one_imu_or_of_all(imu, size):

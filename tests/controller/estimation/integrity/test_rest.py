@@ -175,6 +175,7 @@ HEIGHT = "imu-offset:legs,axis=0/0.89/-0.46,size_m_per_s2={size},ramp_s={within}
 """At rest, the legs' IMUs agree on another height: the IMUs do not show it."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
 @pytest.mark.parametrize("rate", [250.0, 1000.0])
 def test_a_height_that_the_legs_accelerometers_agree_on_is_told_and_covered(rate, fusion):

@@ -88,6 +88,7 @@ class Run:
         return 1e3 * np.sqrt(np.mean(distance**2)), np.degrees(np.sqrt(np.mean(angle**2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "errors", [*(pytest.param(each, marks=pytest.mark.slow) for each in ("gyroscopes", "accelerometers")), "alignments"]
 )
@@ -118,6 +119,7 @@ def test_the_biases_of_the_gyroscopes_are_found(hexapod):
     assert np.degrees(np.abs(run.state["errors"][:, :3] - true)).max() < 0.01
 
 
+@pytest.mark.slow
 def test_at_rest_it_does_not_drift(hexapod):
     run = Run(hexapod, "static", "accelerometers", seconds=40.0)
     distance = 1e3 * np.linalg.norm(run.positions - run.motion.positions, axis=1)
@@ -519,6 +521,7 @@ def test_the_gradient_of_the_errors_is_that_of_the_reading():
             assert gradient[i] == pytest.approx((read(errors + change)[m] - read(errors - change)[m]) / 2e-6, abs=tolerance)
 
 
+@pytest.mark.slow
 def test_a_dead_imu_costs_little_in_motion(hexapod):
     count = 10_000
     used = np.ones((count, 7), np.int64)

@@ -34,6 +34,7 @@ def statistics(model, signatures, data):
     return np.sum((directions.T @ drawn) ** 2, axis=0)
 
 
+@pytest.mark.slow
 def test_a_fault_of_the_computed_size_is_told_with_the_power_and_nothing_without_one(short_model):
     signatures, along = three_axes(), np.array([0.0, 0.89, -0.46])
     one = (signatures @ along)[:, :, None]
@@ -70,6 +71,7 @@ def test_the_quantile_of_a_size_is_that_of_draws(mean):
     assert found[0] == pytest.approx(np.quantile(drawn, 0.999), rel=0.06)
 
 
+@pytest.mark.slow
 def test_a_level_of_the_least_size_covers_all_but_a_thousandth_with_the_best_test(short_model):
     one = 0.35 * (three_axes() @ [0.0, 0.89, -0.46])[:, :, None]
     found = whitened(short_model, one)

@@ -20,6 +20,7 @@ def test_the_bound_falls_with_time_at_rest_and_faster_in_motion():
     assert still.over_the_motion()[0] > still.over_the_motion(1.0)[0] > still.at(2.0)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "most"),
     [

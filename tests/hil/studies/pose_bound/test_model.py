@@ -110,6 +110,7 @@ def test_at_rest_only_biases_of_accelerometers_are_left_in_the_end(hexapod):
     np.testing.assert_allclose(sizes(found), sizes(expected), rtol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e3])
 def test_an_imu_on_the_base_tells_its_force_as_well_as_its_bias_allows(hexapod, size):
     """Biases alone leave those of least squares of 24 forces, three of which are the base's, by pose and the base's force. With
@@ -181,6 +182,7 @@ def test_incremental_encoders_tell_nothing_at_power_on_and_much_in_motion(hexapo
     assert sizes(last(alone, 1))[0] > 50.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("imus", "most"), [(ALL_IMUS, 1.06), (ON_BASE, 1.09)])
 def test_steps_of_20_ms_lose_little_of_a_motion_that_is_as_free_as_the_filters_take_it(hexapod, monkeypatch, imus, most):
     setup = Setup(hexapod, imus, CALIBRATED)
