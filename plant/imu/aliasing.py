@@ -1,24 +1,31 @@
 """Aliasing: vibration and noise that a sensor's low-pass does not take away before it is sampled."""
 
-from math import sqrt
+from math import hypot, inf, sqrt
 
-from plant.imu.model import ImuModel, SensorErrors
+import numpy as np
+
+from plant.imu.model import MOST_CONVERSIONS, ImuModel, SensorErrors
 
 
 def low_pass_gain(sensor: SensorErrors, frequency: float) -> float:
     """The share of a vibration of this frequency [Hz] that passes a sensor's low-pass."""
-    return float((1.0 + (frequency / sensor.section_bandwidth) ** 2) ** (-0.5 * sensor.order))
+    return hypot(1.0, frequency / sensor.section_bandwidth) ** -sensor.order
 
 
 def sampled_noise(model: ImuModel, sensor: SensorErrors, rate: float) -> float:
-    """The noise density of a sensor's samples when they are taken at this rate [Hz], with what aliases of it [unit/sqrt(Hz)].
+    """The noise density of a sensor's samples that are taken at this rate [Hz], with what aliases of it [unit/sqrt(Hz)].
 
-    Where a sample is of several conversions, noise beyond half the rate of samples adds to the noise below it.
+    This is the density at low frequencies. Noise beyond half of this rate adds to it, as far as the low-pass takes in faster
+    conversions and lets it through, or the part samples faster. A sensor without a low-pass has noise up to half the rate of
+    its own samples.
     """
     sampled = min(model.sample_rate or rate, rate)
-    conversions = max(1, round(model.conversion_rate / sampled))
-    passed = (low_pass_gain(sensor, k * sampled) for k in range(-(conversions // 2), conversions - conversions // 2))
-    return sensor.noise * sqrt(sum(gain**2 for gain in passed))
+    taken = model.sample_rate if sensor.bandwidth == inf else max(model.sample_rate, model.conversion_rate)
+    aliases = min(max(1, round(taken / sampled)), MOST_CONVERSIONS)
+    before, share = sensor.smoothing(1.0 / (aliases * sampled))
+    delay = np.exp(-2j * np.pi * np.arange(aliases) / aliases)
+    passed = np.abs((share + before * delay) / (1.0 - (1.0 - before - share) * delay)) ** (2 * sensor.order)
+    return float(sensor.noise * sqrt(passed.sum()))
 
 
 def aliasing_remark(model: ImuModel, rate: float) -> str:
@@ -36,7 +43,7 @@ def aliasing_remark(model: ImuModel, rate: float) -> str:
     if not sensors:
         return ""
     names = " and ".join(
-        f"{name} (" + (f"{sensor.bandwidth:g} Hz" if sensor.bandwidth < float("inf") else "none") + ")"
+        f"{name} (" + (f"{sensor.bandwidth:g} Hz" if sensor.bandwidth < inf else "none") + ")"
         for name, sensor in sensors.items()
     )
     share = max(low_pass_gain(sensor, sampled) for sensor in sensors.values())

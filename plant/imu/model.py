@@ -1,7 +1,7 @@
 """A kind of IMU: its sensors' errors, low-passes and clock."""
 
 from dataclasses import dataclass, fields
-from math import hypot, inf, pi, sqrt
+from math import exp, expm1, hypot, inf, pi, sqrt
 from typing import Any
 
 from plant.errors import InputError
@@ -12,6 +12,8 @@ MILLI_G = 1e-3 * STANDARD_GRAVITY
 
 MOST_SECTIONS = 4
 """The greatest order of a sensor's low-pass."""
+MOST_CONVERSIONS = 4096
+"""The most conversions of an IMU in a cycle; what else fell due in a long gap is left out."""
 
 
 def _check_not_negative(what: str, value: Any) -> None:
@@ -45,6 +47,8 @@ class SensorErrors:
     def __post_init__(self) -> None:
         for field in fields(self):
             _check_not_negative(f"the {field.name} of a sensor", getattr(self, field.name))
+        if self.bandwidth == 0.0:
+            raise InputError("the bandwidth of a sensor is 0; it must be positive")
         if self.order not in range(1, MOST_SECTIONS + 1):
             raise InputError(f"the order of a sensor is {self.order}; it must be a whole number from 1 to {MOST_SECTIONS}")
 
@@ -52,6 +56,16 @@ class SensorErrors:
     def section_bandwidth(self) -> float:
         """-3 dB frequency of each section of the low-pass, so that together they have the bandwidth [Hz]."""
         return self.bandwidth / sqrt(2.0 ** (1.0 / self.order) - 1.0)
+
+    def smoothing(self, period: float) -> tuple[float, float]:
+        """The shares of the previous and the new input in a step of a section, between which the input goes straight [s]."""
+        ratio = 2.0 * pi * self.section_bandwidth * period
+        if ratio == inf:
+            return 0.0, 1.0
+        if ratio == 0.0:
+            return 0.0, 0.0
+        share = -expm1(-ratio)
+        return share / ratio - exp(-ratio), 1.0 - share / ratio
 
 
 @dataclass(frozen=True)

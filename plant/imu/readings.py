@@ -10,7 +10,7 @@ every cycle can be reproduced on its own.
 
 import re
 from collections.abc import Iterable
-from math import exp, expm1, inf, pi, sqrt
+from math import inf, sqrt
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from plant.compiled import MOST, Limits, Record, kernel, record_dtype, shared_ke
 from plant.errors import InputError
 from plant.imu.aliasing import sampled_noise
 from plant.imu.disturbed import DISTURBANCE, EFFECT, MOST_DISTURBANCES, clock_of, disturb, disturbance_record, shakes
-from plant.imu.model import MOST_SECTIONS, ImuModel, SensorErrors
+from plant.imu.model import MOST_CONVERSIONS, MOST_SECTIONS, ImuModel, SensorErrors
 from plant.imu.random_numbers import draw_normals
 from plant.imu_disturbances import Disturbance
 from plant.imu_wiring import BASE_IMU, IMU_COUNT, RIGHT_AXES, RIGHT_WIRING, SLOTS, Wiring
@@ -33,8 +33,6 @@ _AT_ONCE = 1e-6
 """The share of its step by which a conversion may come after a cycle and count as its own, as rounding shifts both."""
 _SLOWEST = 1e-3
 """The slowest clock over its nominal rate; several disturbances may add up to less."""
-_MOST_CONVERSIONS = 4096
-"""The most conversions of an IMU in a cycle; what else fell due in a long gap is left out."""
 
 
 def axes_matrix(axes: str) -> Array:
@@ -100,7 +98,7 @@ IMU_LIMITS: Limits = {
     "order": (1, MOST_SECTIONS),
     "delay": (0, _LONGEST_DELAY),
     "magnetometer_every": (1, MOST),
-    "conversions": (1, _MOST_CONVERSIONS),
+    "conversions": (1, MOST_CONVERSIONS),
     "sparing": (0, 1),
     "spared": (0, 1),
     "disturbance.sensor": (-1, 2),
@@ -133,7 +131,7 @@ def imu_state(
         rotation_from_vector(drawn(k).uniform(-model.misalignment, model.misalignment, 3)) for k in range(SLOTS)
     ]  # fmt: skip
     sampling = 1.0 / model.sample_rate if model.sample_rate else period
-    conversions = min(max(1, round(model.conversion_rate * sampling)), _MOST_CONVERSIONS)
+    conversions = min(max(1, round(model.conversion_rate * sampling)), MOST_CONVERSIONS)
     every = max(1, round(1.0 / (model.magnetometer_rate * sampling)))
     for kind, sensor in enumerate((model.gyroscope, model.accelerometer, model.magnetometer)):
         samples = every * sampling if kind == MAGNETOMETER else sampling
@@ -151,8 +149,9 @@ def imu_state(
         state["rectification"][kind] = sensor.rectification
         for spared, converting in enumerate(periods):
             density = sampled_noise(model, sensor, 1.0 / sampling) if spared and kind != MAGNETOMETER else sensor.noise
-            state["noise"][spared, kind] = density * sqrt(0.5 / converting)
-            state["smoothing"][spared, kind] = _smoothing(sensor.section_bandwidth, converting)
+            # Without a low-pass, faster conversions than samples are not taken in.
+            state["noise"][spared, kind] = density * sqrt(0.5 / (samples if sensor.bandwidth == inf else converting))
+            state["smoothing"][spared, kind] = sensor.smoothing(converting)
         state["order"][kind] = sensor.order
         state["reach"][kind] = sensor.reach
         state["resolution"][kind] = sensor.resolution
@@ -219,17 +218,6 @@ def _changes(sensor: SensorErrors, random: np.random.Generator, eighth: np.rando
     return made
 
 
-def _smoothing(bandwidth: float, period: float) -> tuple[float, float]:
-    """The shares of the previous and the new value in a first-order low-pass."""
-    if bandwidth == inf:
-        return 0.0, 1.0
-    ratio = 2.0 * pi * bandwidth * period
-    if ratio == 0.0:
-        return 0.0, 0.0
-    share = -expm1(-ratio)
-    return share / ratio - exp(-ratio), 1.0 - share / ratio
-
-
 _MEASURE, _MAGNETIC, _WALK, _TIMES, _DISTURBED = range(5)
 """Purposes of random numbers; a sensor's number is added to the last."""
 
@@ -288,7 +276,7 @@ def _convert_when_due(s: Record, imu: int, ideal: Array) -> None:
         # The loop begins each sample, which is complete at the time of the cycle.
         step = (s.time - s.before) / conversions
         s.converted_at[imu], s.part[imu] = s.before, 0
-    for _ in range(_MOST_CONVERSIONS):
+    for _ in range(MOST_CONVERSIONS):
         complete = s.part[imu] + 1 >= conversions
         due = s.converted_at[imu] + step
         if own and due > s.time + _AT_ONCE * step:

@@ -224,7 +224,7 @@ def test_noisier_accelerometers_count_less_and_make_directions_less_certain(hexa
     """What their noise is above the usual one adds to what the filters of a leg and of the platform assume."""
     imu, usual = without_aliases(load_imu("mpu9150-calibrated")), fusion_settings(hexapod)
     found = sensor_settings(hexapod, replace(imu, accelerometer=replace(imu.accelerometer, noise=0.02)), 1000.0)
-    assert found.mechanism_accelerometer_noise == 0.02
+    assert found.mechanism_accelerometer_noise == pytest.approx(0.02)
     for name, sigma in (("leg_accelerometer_noise", "leg_sigma"), ("platform_accelerometer_noise", "tilt_sigma")):
         noise = getattr(found, name)
         assert noise**2 - getattr(usual, name) ** 2 == pytest.approx(0.02**2 - usual.mechanism_accelerometer_noise**2)

@@ -19,9 +19,7 @@ STRENGTH = float(np.linalg.norm(FIELD))
 DIP = np.arctan2(46.0, 18.0)
 ALIGNED = np.eye(3)
 MOUNTING = Rotation.from_rotvec([0.02, -0.03, 0.04]).as_matrix()
-MODEL = replace(
-    load_imu("mpu9150"), misalignment=0.0, accelerometer=SensorErrors(noise=4e-3), conversion_rate=0.0, sparing=False
-)
+MODEL = replace(load_imu("mpu9150"), misalignment=0.0, accelerometer=SensorErrors(noise=4e-3))
 
 
 def turned(seed=0, seconds=60.0, reach=np.pi, mounting=ALIGNED):

@@ -135,26 +135,61 @@ def test_conversions_are_spared_while_nothing_shakes() -> None:
 
 
 @pytest.mark.slow
+def densities(model: ImuModel, period: float, every: int = 1) -> Array:
+    """Of gyroscopes and accelerometers in every n-th cycle of a rest, at low frequencies."""
+    state = imu_state(model, 1, period)
+    measured, ideal = np.empty((4096 * every, 3, 7, 3)), np.zeros((3, 7, 3))
+    for reading in measured:
+        measure(state, ideal, reading)
+    signal = measured[::every, :2].reshape(4096, 2, 21)
+    power = np.abs(np.fft.rfft(signal - signal.mean(axis=0), axis=0)) ** 2 * 2.0 * every * period / 4096
+    return np.sqrt(power[4:200].mean(axis=(0, 2)))
+
+
+def expected(model: ImuModel, rate: float) -> list[float]:
+    return [sampled_noise(model, sensor, rate) for sensor in (model.gyroscope, model.accelerometer)]
+
+
+SHAKEN = disturbance_of_text("imu-vibration:all,axis=z,size_g=0,sine_hz=1")
+
+
 @pytest.mark.parametrize("period", [0.001, 0.004, 0.008])
 @pytest.mark.parametrize("kind", ["gyroscope", "accelerometer"])
 def test_the_noise_of_spared_conversions_has_the_same_density(kind: str, period: float) -> None:
-    """In a band that the low-pass lets through; what it leaves beyond half the rate of the samples aliases into it.
+    """In a band that the low-pass lets through; what it leaves beyond half the rate of the samples aliases into it."""
+    model, which = load_imu("mpu9150-calibrated"), ("gyroscope", "accelerometer").index(kind)
+    spared, converted = (densities(replace(model, disturbances=each), period)[which] for each in ((), (SHAKEN,)))
+    assert [spared, converted] == pytest.approx([expected(model, 1.0 / period)[which]] * 2, rel=0.03)
+    assert spared != converted
 
-    Of noise, the low-pass of 8000 conversions a second lets through 2 to 3 % less than an analog one.
-    """
-    model, found = load_imu("mpu9150-calibrated"), []
-    for texts in ((), ("imu-vibration:all,axis=z,size_g=0,sine_hz=1",)):
-        state = imu_state(model, 1, period)
-        add_disturbances(state, map(disturbance_of_text, texts))
-        measured, ideal = np.empty((4096, 3, 7, 3)), np.zeros((3, 7, 3))
-        for reading in measured:
-            measure(state, ideal, reading)
-        signal = measured[:, ("gyroscope", "accelerometer").index(kind)].reshape(4096, 21)
-        power = np.abs(np.fft.rfft(signal - signal.mean(axis=0), axis=0)) ** 2 * 2.0 * period / 4096
-        found.append(np.sqrt(power[4:200].mean()))
-    density = sampled_noise(model, getattr(model, kind), 1.0 / period)
-    assert found[0] == pytest.approx(density, rel=0.03)
-    assert found[1] == pytest.approx(0.975 * density, rel=0.03)
+
+@pytest.mark.parametrize("order", [1, 2, 4])
+def test_noise_that_aliases_is_that_of_an_analog_low_pass(order: int) -> None:
+    """Of samples that are rare, it is the variance of what leaves the low-pass, spread over half their rate."""
+    sensor = SensorErrors(noise=0.3, bandwidth=200.0, order=order)
+    found = sampled_noise(ImuModel("own", gyroscope=sensor, conversion_rate=48_000.0), sensor, 15.0)
+    frequencies = np.linspace(0.0, 24_000.0, 480_001)
+    passed = np.trapezoid((1.0 + (frequencies / sensor.section_bandwidth) ** 2) ** -order, frequencies)
+    assert found == pytest.approx(0.3 * np.sqrt(passed / 7.5), rel=5e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "every"),
+    [
+        ({"conversion_rate": 5000.0}, 1),  # an odd number
+        ({"conversion_rate": 0.0}, 1),
+        ({"conversion_rate": 0.0, "sample_rate": 1000.0}, 4),  # faster than the loop, which takes every fourth sample
+        ({"conversion_rate": 8000.0, "sample_rate": 1000.0}, 4),
+        ({"conversion_rate": 8000.0, "sample_rate": 250.0}, 1),  # slower than the loop
+    ],
+)
+@pytest.mark.parametrize("bandwidth", [260.0, np.inf])
+def test_parts_of_all_kinds_have_the_noise_that_is_expected(changes: dict[str, float], every: int, bandwidth: float) -> None:
+    sensor = SensorErrors(noise=0.01, bandwidth=bandwidth)
+    model = ImuModel("own", gyroscope=sensor, accelerometer=sensor, **changes)
+    period = 1e-3 if every > 1 else 1.0 / (model.sample_rate or 1000.0)
+    found = densities(model, period, every)
+    assert found == pytest.approx(expected(model, 1.0 / (every * period)), rel=0.05)
 
 
 def test_sparing_needs_no_conversions() -> None:
