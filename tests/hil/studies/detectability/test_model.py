@@ -75,6 +75,16 @@ def test_uncertainty_about_drives_and_sensors_makes_estimates_worse(hexapod, sho
     assert min(sizes[1:]) > sizes[0]
 
 
+def test_noise_that_aliases_counts(hexapod):
+    """In slow loops, as in `tests/controller/test_settings.py`."""
+    imu = replace(load_imu("mpu9150-calibrated"), conversion_rate=400e3)
+    motion = motion_along(load_target("sines", hexapod, 2.0), hexapod, STEP_S * np.arange(3))
+    noise = linear_model(hexapod, motion, imu, 250.0, Uncertainty(), STEP_S).noise[:42].reshape(7, 2, 3)
+    x = np.pi * np.array([256.0, 260.0]) / 250.0
+    densities = np.array([imu.gyroscope.noise, imu.accelerometer.noise]) * np.sqrt(x / np.tanh(x))
+    np.testing.assert_allclose(noise, np.broadcast_to((densities**2 / (2.0 * STEP_S))[:, None], noise.shape), rtol=5e-3)
+
+
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.inf, np.nan])
 def test_an_uncertainty_must_be_positive_and_finite(wrong):
     with pytest.raises(InputError, match="the wander_time of the uncertainty"):

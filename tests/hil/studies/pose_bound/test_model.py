@@ -100,6 +100,17 @@ def test_the_errors_of_imus_are_as_large_as_the_imu_layer_draws_them(hexapod, im
         np.testing.assert_allclose(found[rows], expected[rows], rtol=0.35)
 
 
+def test_noise_that_aliases_counts(hexapod):
+    """In slow loops, as in `tests/controller/test_settings.py`."""
+    own = ImuModel(
+        "own", SensorErrors(noise=1e-3, bandwidth=256.0), SensorErrors(noise=5e-3, bandwidth=260.0), conversion_rate=400e3
+    )
+    noise = LinearModel(Setup(hexapod, (6,), own, rate=250.0)).noise
+    x = np.pi * np.array([256.0, 260.0]) / 250.0
+    densities = np.array([1e-3, 5e-3]) * np.sqrt(x / np.tanh(x))
+    np.testing.assert_allclose(noise, np.repeat(densities**2 / (2.0 * STEP_S), 3), rtol=5e-3)
+
+
 def test_at_rest_only_biases_of_accelerometers_are_left_in_the_end(hexapod):
     """Then the bound is that of least squares of 21 forces, each with the variance of a bias."""
     kind = ImuModel("biased", SensorErrors(noise=1e-6), SensorErrors(noise=1e-5, bias=(MILLI_G, MILLI_G)))
