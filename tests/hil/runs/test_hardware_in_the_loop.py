@@ -137,7 +137,7 @@ def test_over_udp_it_follows_as_with_the_plant_itself_and_says_how_the_bus_was(t
 @pytest.mark.slow
 def test_over_canopen_it_follows_and_replays(tmp_path, canopen_file):
     """IMUs whose node waits for a processor are left out for a while; what is checked holds nevertheless. At 125 Hz they may
-    wait for twice as long as at 250. Their samples come at this rate too, as the noise of a faster part is larger, and the
+    wait for twice as long as at 250. Their samples come at this rate too, and the
     gains are lower than those of the preset, which oscillate when samples are late.
 
     On a busy machine all of them may wait at once, which ends a run as it should. If samples were late, there is another.
