@@ -7,21 +7,24 @@ from hil.rigs import ENABLED
 from hil.rigs.contract import LEG_SPEED, LEG_STROKE_S, examine_rig
 from hil.rigs.template import TemplateRig
 from plant.imu import imu_state, load_imu, measure
+from plant.imu.presets import imu_of_table
 from plant.mechanism import load_spatial
 
 PERIOD = 0.005
 HEXAPOD = load_spatial("hexapod")
 pytestmark = pytest.mark.usefixtures("virtual_time")
 GYROSCOPE, ACCELEROMETER = 0, 1
+# The widest low-pass below half of this rate.
+NARROW = imu_of_table({"based_on": "mpu9150-calibrated", "low_pass": 2}, "narrow", "narrow.toml")
 
 
 class Miswired(TemplateRig):
     """The template with IMUs as they are sold, and with factors on commands and readings; like hardware, it knows no truth."""
 
-    def __init__(self, command=1.0, gyroscope=1.0, accelerometer=1.0, seed=3, imu="mpu9150-calibrated", start=0.0, encoder=1.0):
+    def __init__(self, command=1.0, gyroscope=1.0, accelerometer=1.0, seed=3, imu=NARROW, start=0.0, encoder=1.0):
         super().__init__(HEXAPOD, PERIOD, None)
         self.factors, self.start, self.moved, self.encoder = (command, gyroscope, accelerometer), start, np.zeros(6), encoder
-        self.imu, self.read = imu_state(load_imu(imu), seed, PERIOD), np.zeros((3, 7, 3))
+        self.imu, self.read = imu_state(imu, seed, PERIOD), np.zeros((3, 7, 3))
 
     def open(self):
         super().open()
@@ -57,10 +60,16 @@ def examined(**wrong):
 @pytest.mark.parametrize(
     "rig",
     [
-        {"imu": "mpu9150", "seed": 1},
+        {"imu": load_imu("mpu9150"), "seed": 1},
         *(
             pytest.param(each, marks=pytest.mark.slow)
-            for each in ({}, {"imu": "ideal"}, {"start": np.array([5, -5, 8, -8, 5, -5]) * 1e-3}, {"command": 1.3})
+            for each in (
+                {},
+                {"imu": load_imu("ideal")},
+                {"imu": load_imu("mpu9150-calibrated")},
+                {"start": np.array([5, -5, 8, -8, 5, -5]) * 1e-3},
+                {"command": 1.3},
+            )
         ),
     ],
 )
