@@ -63,10 +63,16 @@ def state_of(control):
     return {"drive": [-1] * 6, "velocity": [0.0] * 6, "code": [0] * 6, "lengths": [0.0] * 6}
 
 
-def started(at, control, *options, rig="udp"):
-    """A run whose drives follow, and move; without a channel its loop is the first process that it starts."""
+def tried(at, control, *options, rig="udp"):
+    """A run whose drives follow, and move, or that has ended; without a channel its loop is its first process."""
     process = gough("run", "--rig", rig, "--rig-at", at, "--channel", "none", *MOTION, *PATIENT, "--duration", 60, *options)
     wait_for(lambda: process.poll() is not None or moves(state_of(control)))
+    return process
+
+
+def started(at, control, *options):
+    """A run whose drives follow, and move."""
+    process = tried(at, control, *options)
     assert process.poll() is None, process.communicate()
     return process
 
@@ -210,14 +216,20 @@ def test_when_the_loop_is_killed_the_drives_stop_by_themselves(tmp_path):
 
 @pytest.mark.slow
 def test_when_the_loop_is_killed_canopen_drives_stop_by_their_heartbeat(canopen_file):
-    with emulated("--bus", "canopen", "--rate", 250, at=str(canopen_file)) as (_, at, control):
-        run = started(at, control, "--rate", 250, rig="canopen")
-        os.kill(loop_of(run), signal.SIGKILL)
-        wait_for(lambda: DriveState.FOLLOWING not in state_of(control)["drive"], 10.0)
-        time.sleep(0.5)
-        state = state_of(control)
-        assert state["velocity"] == [0.0] * 6
-        assert finished(run)[0] == 1
+    """On a busy machine all IMUs may wait for a processor at once, which ends a run as it should. Then there is another."""
+    for _ in range(6):
+        with emulated("--bus", "canopen", "--rate", 250, at=str(canopen_file)) as (_, at, control):
+            run = tried(at, control, "--rate", 250, rig="canopen")
+            if run.poll() is not None:
+                assert "stopped" in finished(run)[2]
+                continue
+            os.kill(loop_of(run), signal.SIGKILL)
+            wait_for(lambda: DriveState.FOLLOWING not in state_of(control)["drive"], 10.0)
+            time.sleep(0.5)
+            assert state_of(control)["velocity"] == [0.0] * 6
+            assert finished(run)[0] == 1
+            return
+    pytest.fail("each of six runs lost its IMUs")
 
 
 @pytest.mark.slow
