@@ -44,13 +44,18 @@ _UNEXPLAINED, _UNEXPLAINED_EVALUATIONS = 1.25, 3
 than one IMU is wrong, though none of them may be beyond the limit.
 """
 
+_ENDING = 0.66
+"""Beyond this share of the limit, evidence of recent readings ends a run where no IMU could be left out: all IMUs share the
+error, or it is of one that is needed. Leaving out an IMU takes more.
+"""
+
 _LASTING, _LASTING_EVALUATIONS = 0.36, 6
 """Evidence against an IMU that cannot be left out ends the run beyond this share of the limit, in so many evaluations in a row.
 """
 
 _FIRST_COUNTED = 20
-"""From which evaluation on both count: until then nothing has been learned, and what a calibration does not know, such as
-clocks of the IMUs' own, is left unexplained, above all at low rates.
+"""From which evaluation on these three count: until then nothing has been learned, and what a calibration does not know, such
+as clocks of the IMUs' own, is left unexplained, above all at low rates.
 """
 
 _NEARLY = 0.7
@@ -400,8 +405,8 @@ def judge_evidence(
     out the IMU that the evidence blames, if it clearly blames this one alone and the rest agrees; wait for more if that is not
     clear; else stop. Returns whether the set of IMUs has changed.
 
-    Below the limit, stop if three evaluations in a row leave too much unexplained, or if evidence against an IMU that cannot be
-    left out lasts.
+    Below the limit, stop if all IMUs share the error or one has it that cannot be left out, if evidence against that one lasts,
+    or if three evaluations in a row leave too much unexplained.
     """
     w, limit, e = s.watch, p.watch.evidence, integrity
     back = False
@@ -422,12 +427,15 @@ def judge_evidence(
         _count_evaluations(p.watch, w, e, rest, usual_rest)
     if back or not _moves(s):
         return back
-    k, most = e.blamed, np.sqrt(limit)
-    if not e.best_evidence >= limit:
+    k = e.blamed
+    ends = k < 0 or _is_needed(p.watch, k)
+    least = _ENDING * limit if ends and judged and e.evaluations >= _FIRST_COUNTED else limit
+    most = np.sqrt(least)
+    if not e.best_evidence >= least:
         if judged and w.lasting[1] > 0.0:
-            found, least = np.sqrt(w.lasting)
-            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, found, least)
-            _report_rival(s, e, least)
+            found, most = np.sqrt(w.lasting)
+            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, found, most)
+            _report_rival(s, e, most)
         return False
     if k < 0:
         cause = Cause.GYROSCOPES_SHARE + e.shared
@@ -443,7 +451,7 @@ def judge_evidence(
         report_event(s.events, Cause.IMU_CONTRADICTED, k, np.sqrt(e.imu_evidence), most)
         return True
     # Nothing is gained by waiting where the IMU cannot be left out.
-    certain = (clear and rest_agrees) or e.best_evidence >= _PATIENT * limit or _is_needed(p.watch, k)
+    certain = ends or (clear and rest_agrees) or e.best_evidence >= _PATIENT * limit
     if certain or (judged and w.unexplained_for >= _UNEXPLAINED_EVALUATIONS):
         handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), most)
         _report_rival(s, e, most)

@@ -689,6 +689,33 @@ def test_evidence_that_lasts_against_the_platforms_imu_ends_a_motion_below_the_l
         assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(4.9), pytest.approx(4.8))
 
 
+@pytest.mark.parametrize(
+    ("imu", "evidence", "changes", "expected"),
+    [
+        (-1, 6.6, {}, 1),
+        (-1, 6.4, {}, None),
+        (6, 6.6, {}, 1),
+        (2, 7.9, {}, None),
+        (-1, 6.6, {"evaluations": 19}, None),
+        (-1, 7.9, {"of_learned": 1}, None),
+        (-1, 8.1, {"of_learned": 1, "evaluations": 19}, 1),
+    ],
+)
+def test_less_evidence_ends_a_motion_where_no_imu_could_be_left_out(imu, evidence, changes, expected):
+    """All share the error, or it is the platform's: the root of 0.66 x 64, in recent readings, after the first two seconds."""
+    _, parameters, state = moving()
+    integrity = state["integrity"]
+    integrity["evaluations"] = changes.get("evaluations", 20)
+    integrity["evidence"]["of_learned"] = changes.get("of_learned", 0)
+    integrity["shared"] = 0
+    weigh(state, imu, evidence, evidence)
+    assert evaluations_until_a_stop(parameters, state, 5) == expected
+    if expected:
+        cause = Cause.GYROSCOPES_SHARE if imu < 0 else Cause.IMUS_CONTRADICT
+        limit = 8.0 if changes else np.sqrt(0.66 * 64.0)
+        assert stop_of(state) == (cause, imu, pytest.approx(evidence), pytest.approx(limit))
+
+
 @pytest.mark.parametrize("change", ["back", "parity"])
 def test_evidence_about_another_set_of_imus_does_not_last(change):
     _, parameters, state = moving()
