@@ -30,6 +30,9 @@ _ZERO_ALLOWED = (
 _SWITCHES = "watch_imus", "need_platform_imu"
 _MOST = {"protection_position": (1.0, "m"), "protection_rotation": (pi, "rad")}
 
+_LOW_RATE_HZ = 250.0
+_HOLD_AT_LOW_RATES_S = 1.0
+
 S = TypeVar("S", "ControlSettings", "FusionSettings", "SafetySettings", "DriveSettings")
 
 
@@ -72,7 +75,7 @@ class ControlSettings(_Settings):
     integral: float = 200.0  # gain on its integral [1/s^2]
     derivative: float = 0.0  # gain on its derivative [-]
     derivative_bandwidth: float = 100.0  # corner of the derivative's low-pass [rad/s]
-    hold: float = 0.2  # so long the brakes hold while the estimate settles [s]
+    hold: float = 0.2  # so long the brakes hold while the estimate settles, from 250 Hz on [s]
     command_reserve: float = 1.4  # largest command, as a multiple of the actuators' velocity limit
     position_proportional: float = 15.0  # instead of `proportional` where drives close position loops [1/s]
     position_integral: float = 10.0  # instead of `integral` [1/s^2]
@@ -83,6 +86,13 @@ class ControlSettings(_Settings):
         An outer loop must be slower than the one within it: gains for drives that follow velocities let stiff ones oscillate.
         """
         return replace(self, proportional=self.position_proportional, integral=self.position_integral, derivative=0.0)
+
+    def hold_at(self, rate: float) -> float:
+        """How long the brakes hold in a loop of this rate [Hz]: `hold`, but at low rates at least 1 s.
+
+        The filters begin with large gains on the accelerometers. With few cycles per second, these let the loop oscillate.
+        """
+        return max(self.hold, _HOLD_AT_LOW_RATES_S) if rate < _LOW_RATE_HZ else self.hold
 
 
 @dataclass(frozen=True)

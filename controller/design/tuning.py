@@ -192,15 +192,20 @@ class Design:
         text = f"stable with rates down to {floor}, and {self.hold:.2g} s after the filters have begun"
         if self.longer_hold is not None:
             text += (
-                f", which is more than the {self.gains.hold:g} s of hold in [control]: it takes hold = {self.longer_hold:g}, "
-                "which --write writes with the gains"
+                f", which is more than the {self._present_hold:g} s for which the brakes hold: "
+                f"it takes hold = {self.longer_hold:g}, which --write writes with the gains"
             )
         return text
 
     @property
     def longer_hold(self) -> float | None:
         """The `hold` that these gains need [s], as it is shown and not below what was found; None if theirs is enough."""
-        return float(np.ceil(100.0 * self.hold - 1e-9) / 100.0) if self.hold > self.gains.hold else None
+        return float(np.ceil(100.0 * self.hold - 1e-9) / 100.0) if self.hold > self._present_hold else None
+
+    @property
+    def _present_hold(self) -> float:
+        """How long the brakes hold without a change of `hold` [s]."""
+        return self.gains.hold_at(self.setup.rate)
 
     def rows(self) -> list[tuple[str, str, str]]:
         """Label, value and unit of each figure at home."""
@@ -294,7 +299,7 @@ def tune(
     design = Design(
         mechanism, setup, rule, gains, at_home,
         tuple(PoseMargins(*each) for each in zip(where[1:], elsewhere, strict=True)),
-        preset, margins(found[0], preset), setup.rate, preset.hold, tuple(found),
+        preset, margins(found[0], preset), setup.rate, preset.hold_at(setup.rate), tuple(found),
     )  # fmt: skip
     progress(0.7)
     hold = shortest_hold(mechanism, setup, gains, where, lambda share: progress(0.7 + 0.2 * share))
@@ -427,12 +432,12 @@ def lowest_stable_rate(
 def shortest_hold(
     mechanism: Mechanism, setup: Setup, gains: ControlSettings, poses: Sequence[Pose], progress: Progress = _silent
 ) -> float:
-    """The shortest time on the brakes, from `hold` of the gains on, after which the loop is stable at all poses [s].
+    """The shortest time on the brakes, from the gains' own on, after which the loop is stable at all poses [s].
 
     Raises:
         SingularConfigurationError: it is not even when the filters have settled.
     """
-    left, hold = list(poses), gains.hold
+    left, hold = list(poses), gains.hold_at(setup.rate)
     while left:
         unstable = []
         for tried, pose in enumerate(left, start=1):

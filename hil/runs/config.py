@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from controller.frames import ActiveFrames, Frames
     from controller.planning.motions import Motion
     from controller.planning.target import Target, TargetFunction
+    from controller.settings import ControlSettings
     from hil.rigs import Rig
     from plant.compiled import Record
     from plant.encoders import EncoderModel
@@ -291,6 +292,10 @@ class SimulationConfig:
             raise UnknownNameError(f"no drives {self.drives!r}; there are {', '.join(DRIVES)}{nearest(self.drives, DRIVES)}")
         if self.lengths != NO_LENGTHS and self.fusion == "section-5":
             raise InputError("the paper's section 5 takes no lengths: leave --lengths out, or take another --fusion")
+
+    def hold_of(self, control: "ControlSettings") -> float:
+        """How long the brakes hold before the motion, with these settings of the mechanism [s]."""
+        return control.hold_at(self.rate) if self.hold is None else self.hold
 
     @property
     def active_frames(self) -> "ActiveFrames | None":

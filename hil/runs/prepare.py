@@ -126,7 +126,8 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
         model = load_imu(config.imu)
         imu = imu_state(model, config.seed, period, config.wiring, config.base_imu)
         encoder = load_encoder(config.lengths)
-        control = control_settings(mechanism, **({} if config.hold is None else {"hold": config.hold}))
+        control = control_settings(mechanism)
+        control = replace(control, hold=config.hold_of(control))
         position = closes_position(config)
         if position:
             control = control.for_position_drives()
@@ -253,7 +254,7 @@ def simulated_plant(
         fmu = default_fmu(model_of(nominal)) if built_fmu is None else built_fmu()
     binding = OWN_BINDING if config.binding is None else load_binding(config.binding)
     built = nominal.built(config.joint_error, config.seed)
-    hold = control_settings(nominal).hold if config.hold is None else config.hold
+    hold = config.hold_of(control_settings(nominal))
     settings = [each if each.at is None else replace(each, at=each.at + hold) for each in config.settings]
     late = [each for each in config.settings if each.at is not None and each.at >= config.duration]
     if late:

@@ -119,7 +119,8 @@ STATE = record_dtype(
     feedback_before=(np.float64, LEGS),  # its mean in the last full window [m/s]
     samples=(np.int64, IMU_COUNT),
     jumped=np.float64,  # greatest change of a leg's mean feedback since the window before [m/s]
-    acceleration=(np.float64, LEGS),  # of the legs at the end of the last window
+    rate=(np.float64, LEGS),  # of the legs at the end of the last window
+    acceleration=(np.float64, LEGS),  # and their acceleration
     next_path=PATH,  # in the middle of the present window
     arms=(np.float64, (LEGS, 3)),  # of the legs then, as their directions and lengths
     directions=(np.float64, (LEGS, 3)),
@@ -248,13 +249,18 @@ def _collect(p: Record, s: Record, imus: Record, pose: Record, legs: Array, comm
 
 
 @kernel
-def _find_motion(s: Record) -> None:
+def _find_motion(p: Record, s: Record, legs: Array) -> None:
     """Write the mean motion of the full window, as the readings are means. Where a plan that follows points jerks to and fro,
-    the acceleration of its middle is off by 0.1 m/s^2.
+    the acceleration of its middle is off by 0.1 m/s^2, and the mean of a few accelerations by half of that. So the mean
+    acceleration is the change of the rate since the window before, if that is known.
     """
+    follows = s.windows > 0 and s.lost == 0
     for k in range(LEGS):
         for i in range(3):
             s.planned[k, i] /= s.collected
+        if follows:
+            s.planned[k, 2] = (legs[k, 1] - s.rate[k]) / p.duration
+        s.rate[k] = legs[k, 1]
     motion_of_legs(s.arms, s.directions, s.lengths, LEGS, s.planned, s.factor, s.derivatives)
     motion = s.next_path.motion
     for i in range(3):
@@ -267,13 +273,13 @@ def _find_motion(s: Record) -> None:
 @kernel
 def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: Array) -> None:
     """Keep the full window for its jobs, and find how far the loop's pose has left its path."""
-    _find_motion(s)
+    _find_motion(p, s, legs)
     fastest, change, turning, jumped = 0.0, 0.0, 0.0, 0.0
     for i in range(3):
         turning += s.next_path.motion[ANGULAR_ACCELERATION, i] ** 2
     turning = np.sqrt(turning)
     for k in range(LEGS):
-        fastest = max(fastest, abs(legs[k, 2]))
+        fastest = max(fastest, abs(s.planned[k, 2]))
         turning = max(turning, abs(legs[k, 2]) / legs[k, 0])
         change = max(change, abs(legs[k, 2] - s.acceleration[k]))
         s.acceleration[k] = legs[k, 2]

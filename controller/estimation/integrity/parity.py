@@ -31,6 +31,9 @@ _TWIST, _FIRST, _WITH_BASE = 6, 6, 9
 _LIMIT = radians(0.55)
 """Error of an angular velocity that is told: several times what calibrated gyroscopes have [rad/s]."""
 
+_NOISE_SIGMAS = 6.0
+"""The limit is at least so many standard deviations of the noise of a window's mean: an error has three components."""
+
 _LATE_S = 1e-3
 """The limit grows by the angular acceleration times this, as the times of samples are uncertain [s]."""
 
@@ -97,7 +100,9 @@ STATE = record_dtype(
 
 
 @kernel
-def step_parity(s: Record, f: Record, excluded: Array, frames: Array, samples: int, period: float, shaking: Record) -> bool:
+def step_parity(
+    s: Record, f: Record, excluded: Array, frames: Array, samples: int, period: float, variance: float, shaking: Record
+) -> bool:
     """Look at the last full window, once its readings are predicted; returns whether gyroscopes contradict each other.
 
     Args:
@@ -107,6 +112,7 @@ def step_parity(s: Record, f: Record, excluded: Array, frames: Array, samples: i
         frames: (7, 3, 3), axes of the IMUs in {1} by rows, of late: zeros if they are not known yet.
         samples: of an IMU in a window.
         period: of the samples [s].
+        variance: of a sample's noise, angular velocity [rad^2/s^2].
         shaking: dtype `shaking.STATE`. Its `no_motion` is written: the variance of a sample that stands for what an
             accelerometer reads that is no motion [m^2/s^4]; all samples of a window share it. 0 within the limit.
     """
@@ -116,7 +122,8 @@ def step_parity(s: Record, f: Record, excluded: Array, frames: Array, samples: i
     worst, s.error = _find_worst(s, f, excluded, -1, _TWIST)
     s.worst = max(worst, 0)
     s.twist[:] = s.fit[:_TWIST]
-    s.limit = _LIMIT + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
+    least = max(_LIMIT, _NOISE_SIGMAS * np.sqrt(variance / samples))
+    s.limit = least + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
     if s.error <= s.limit:
         _learn_usual(s, f, excluded, duration / _USUAL_S)
     _compare_forces(s, f, excluded, samples, duration, shaking)

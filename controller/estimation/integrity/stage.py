@@ -160,7 +160,14 @@ def step_integrity(
         s.compared = s.filter.windows
         s.contradicts = s.filter.windows > 0 and (
             parity.step_parity(
-                s.parity, s.filter, imus.excluded, s.hypotheses.frames, p.filter.window, rig.period, imus.shaking
+                s.parity,
+                s.filter,
+                imus.excluded,
+                s.hypotheses.frames,
+                p.filter.window,
+                rig.period,
+                p.filter.variance[0],
+                imus.shaking,
             )
             or s.parity.shared != 0
             or s.parity.two != 0

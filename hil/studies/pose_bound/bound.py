@@ -90,7 +90,7 @@ def find_bound(config: SimulationConfig) -> PoseBound:
     )
     if not imus and setup.encoder is None:
         raise InputError("there is no sensor: name IMUs with --imus, or encoders with --lengths")
-    hold = control_settings(mechanism).hold if config.hold is None else config.hold
+    hold = config.hold_of(control_settings(mechanism))
     return bound_of(setup, config.target, config.duration, hold, config.base_motions)
 
 

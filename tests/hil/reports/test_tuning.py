@@ -72,9 +72,12 @@ def test_every_figure_is_there(name, count, tmp_path, recwarn):
 def test_the_remark_tells_a_hold_that_is_too_short():
     design = replace(design_of("planar-3rpr", 0), hold=0.412)
     assert design.remark == (
-        "stable with rates down to 120 Hz, and 0.41 s after the filters have begun, which is more than the 0.2 s of hold in "
-        "[control]: it takes hold = 0.42, which --write writes with the gains"
+        "stable with rates down to 120 Hz, and 0.41 s after the filters have begun, which is more than the 0.2 s for which "
+        "the brakes hold: it takes hold = 0.42, which --write writes with the gains"
     )
+    slow = replace(design, setup=replace(design.setup, rate=125.0), hold=1.3)
+    assert "more than the 1 s for which the brakes hold: it takes hold = 1.3," in slow.remark
+    assert slow.longer_hold == 1.3 and replace(slow, hold=1.0).longer_hold is None
     assert "50 Hz, the lowest that there is" in replace(design, lowest_rate=50.0).remark
 
 

@@ -10,11 +10,11 @@ from tests.controller.estimation.integrity.made_up import RATE_HZ, constants, fi
 LIMIT = np.radians(0.55)
 
 
-def parity(state):
+def parity(state, variance=0.0):
     """Whether gyroscopes contradict each other in the last window."""
     s, imus = state["integrity"], state["imus"]
     frames, shaking = s["hypotheses"]["frames"], imus["shaking"][()]
-    return bool(step_parity(s["parity"][()], s["filter"][()], imus["excluded"], frames, 5, 1.0 / RATE_HZ, shaking))
+    return bool(step_parity(s["parity"][()], s["filter"][()], imus["excluded"], frames, 5, 1.0 / RATE_HZ, variance, shaking))
 
 
 def look(imu=None, fault=(0.0, 0.0, 0.0), kind="0.5", lost=(), excluded=(), windows=3, sensor=0, state=None, made=None):
@@ -33,6 +33,18 @@ def look(imu=None, fault=(0.0, 0.0, 0.0), kind="0.5", lost=(), excluded=(), wind
         filtered(mechanism, part, parameters, state)
         told.append(parity(state))
     return s, told
+
+
+@pytest.mark.parametrize(("of_a_sample", "least"), [(0.2, 0.55), (0.3, 0.55 * 0.3 / 0.205), (0.41, 1.1)])
+def test_the_limit_is_six_standard_deviations_of_noise_if_that_is_more(of_a_sample, least):
+    """The mean of 5 samples has 1 / sqrt(5) of a sample's noise [deg/s]; what turning adds is the same for all."""
+    mechanism, r = readings("0.5", 1.0, 2)
+    parameters, state = constants(mechanism)
+    filtered(mechanism, type(r)(*(each[:6] for each in vars(r).values())), parameters, state)
+    parity(state)
+    quiet = float(state["integrity"]["parity"]["limit"])
+    parity(state, np.radians(of_a_sample) ** 2)
+    assert state["integrity"]["parity"]["limit"] - quiet + LIMIT == pytest.approx(np.radians(least), rel=3e-3)
 
 
 def sum_of_squares(f, used):
