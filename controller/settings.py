@@ -75,7 +75,7 @@ class ControlSettings(_Settings):
     integral: float = 200.0  # gain on its integral [1/s^2]
     derivative: float = 0.0  # gain on its derivative [-]
     derivative_bandwidth: float = 100.0  # corner of the derivative's low-pass [rad/s]
-    hold: float = 0.2  # so long the brakes hold while the estimate settles, from 250 Hz on [s]
+    hold: float = 0.2  # so long the brakes hold while the estimate settles; below 250 Hz at least 1 s [s]
     command_reserve: float = 1.4  # largest command, as a multiple of the actuators' velocity limit
     position_proportional: float = 15.0  # instead of `proportional` where drives close position loops [1/s]
     position_integral: float = 10.0  # instead of `integral` [1/s^2]

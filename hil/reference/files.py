@@ -402,7 +402,9 @@ def _run() -> list[Entry]:
         unit = {"mm": "m", "ms": "s"}.get(option.unit, option.unit) if option else "s"
         kind = {bool: "true or false", int: "whole number", float: "number"}.get(type(of_config[name].default), "text")
         default = (option.shown if option else None) or shown(of_config[name].default)
-        text = option.text if option else "how long the brakes hold first; without it the time in the mechanism's settings"
+        text = (
+            option.text if option else "how long the brakes hold first; without it the mechanism's, below 250 Hz at least 1 s"
+        )
         found.append(Entry(name, kind if option else "number", unit, "" if default == "[]" else default, "", text))
     return found
 

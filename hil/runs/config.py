@@ -101,7 +101,8 @@ class SimulationConfig:
     (`controller.planning.target.TargetFunction`). Fields that are options say below what they mean; the others:
 
     Attributes:
-        hold: how long the brakes hold first [s]; None for the time in the mechanism's settings.
+        hold: how long the brakes hold first [s]; None for the time in the mechanism's settings, below 250 Hz
+            at least 1 s.
         wiring: how the IMUs are mounted and wired.
         raw_imus: whether the IMUs are known to be uncalibrated, so that disagreement between them says nothing.
         open_loop: whether the drives follow the planned speeds, and IMUs only show a drive that does not: before a calibration.

@@ -127,13 +127,14 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
         imu = imu_state(model, config.seed, period, config.wiring, config.base_imu)
         encoder = load_encoder(config.lengths)
         control = control_settings(mechanism)
+        least, most = HOLD_RANGE_S
+        given = control.hold if config.hold is None else config.hold
+        if not least <= given <= most:
+            raise InputError(f"hold is {given:g} s; the estimate settles in {least:g} to {most:g} s")
         control = replace(control, hold=config.hold_of(control))
         position = closes_position(config)
         if position:
             control = control.for_position_drives()
-        least, most = HOLD_RANGE_S
-        if not least <= control.hold <= most:
-            raise InputError(f"hold is {control.hold:g} s; the estimate settles in {least:g} to {most:g} s")
         add_disturbances(imu, (each.later(control.hold) for each in config.disturbances))
         encoder_faults = [each.later(control.hold) for each in config.encoder_faults]
         fusion, safety = sensor_settings(mechanism, model, config.rate, encoder), safety_settings(mechanism)

@@ -252,7 +252,8 @@ def _collect(p: Record, s: Record, imus: Record, pose: Record, legs: Array, comm
 def _find_motion(p: Record, s: Record, legs: Array) -> None:
     """Write the mean motion of the full window, as the readings are means. Where a plan that follows points jerks to and fro,
     the acceleration of its middle is off by 0.1 m/s^2, and the mean of a few accelerations by half of that. So the mean
-    acceleration is the change of the rate since the window before, if that is known.
+    acceleration is the change of the rate since the window before, if that is known. Drives hold a command for a cycle, so a
+    reading tells of the cycle before it, and this is the change over just these cycles.
     """
     follows = s.windows > 0 and s.lost == 0
     for k in range(LEGS):

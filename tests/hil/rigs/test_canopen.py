@@ -661,7 +661,7 @@ def test_two_processes_by_multicast():
         rig.arm()
         # On a busy machine, many answers are late.
         feedback, statuses = run(rig, 200, np.full(6, 0.05))
-        assert statuses.count(ANSWERED) >= 80
+        assert statuses.count(ANSWERED) >= 120
         np.testing.assert_array_equal(feedback["drive"], FOLLOWING)
         rig.quick_stop()
         feedback, _ = run(rig, 30, request=QUICK_STOP)

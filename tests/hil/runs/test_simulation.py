@@ -301,6 +301,17 @@ def test_at_low_rates_the_brakes_hold_for_longer(rate, seconds):
     assert (result.records["mode"] < Mode.RUNNING).sum() == np.ceil(seconds * rate)
 
 
+@pytest.mark.parametrize("rate", [200.0, 1000.0])
+@pytest.mark.parametrize("hold", [0.19, 10.1])
+def test_a_hold_in_which_no_estimate_settles_is_refused(hold, rate):
+    with pytest.raises(InputError, match=f"hold is {hold:g} s; the estimate settles in 0.2 to 10 s"):
+        simulate(SimulationConfig(hold=hold, rate=rate))
+    mechanism = load_mechanism("hexapod")
+    settings = {**mechanism.settings, "control": {"hold": hold}}
+    with pytest.raises(InputError, match=f"hold is {hold:g} s"):
+        simulate(SimulationConfig(mechanism=replace(mechanism, settings=settings), rate=rate))
+
+
 @pytest.mark.parametrize("fusion", ["compiled", "whole"])
 @pytest.mark.parametrize("rate", [62.0, 100.0, 150.0, 200.0])
 def test_the_loop_does_not_oscillate_at_low_rates(rate, fusion):
