@@ -130,7 +130,7 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
         least, most = HOLD_RANGE_S
         given = control.hold if config.hold is None else config.hold
         if not least <= given <= most:
-            raise InputError(f"hold is {given:g} s; the estimate settles in {least:g} to {most:g} s")
+            raise InputError(f"hold is {given:g} s; it must be {least:g} to {most:g} s")
         control = replace(control, hold=config.hold_of(control))
         position = closes_position(config)
         if position:

@@ -304,7 +304,7 @@ def test_at_low_rates_the_brakes_hold_for_longer(rate, seconds):
 @pytest.mark.parametrize("rate", [200.0, 1000.0])
 @pytest.mark.parametrize("hold", [0.19, 10.1])
 def test_a_hold_in_which_no_estimate_settles_is_refused(hold, rate):
-    with pytest.raises(InputError, match=f"hold is {hold:g} s; the estimate settles in 0.2 to 10 s"):
+    with pytest.raises(InputError, match=f"hold is {hold:g} s; it must be 0.2 to 10 s"):
         simulate(SimulationConfig(hold=hold, rate=rate))
     mechanism = load_mechanism("hexapod")
     settings = {**mechanism.settings, "control": {"hold": hold}}
