@@ -41,13 +41,13 @@ class Table:
         self.rows.append([Cell(cell) if isinstance(cell, str) else cell for cell in cells])
 
     def print(self, markdown: bool = False) -> None:
-        """Print the table, as wide as the terminal or 100 characters wide, or its Markdown."""
+        """Print the table, as wide as the terminal or, where there is none, 140 characters wide, or its Markdown."""
         if markdown:
             print(self.markdown())
             return
         from rich.console import Console
 
-        Console(width=None if sys.stdout.isatty() else 100).print(self.rich())
+        Console(width=None if sys.stdout.isatty() else 140).print(self.rich())
 
     def rich(self) -> "RichTable":
         """The table as rich draws it."""

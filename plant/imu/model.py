@@ -48,7 +48,7 @@ class SensorErrors:
         for field in fields(self):
             _check_not_negative(f"the {field.name} of a sensor", getattr(self, field.name))
         if self.bandwidth == 0.0:
-            raise InputError("the bandwidth of a sensor is 0; it must be positive")
+            raise InputError("the bandwidth of a sensor is 0; it must be positive: leave it out if there is no low-pass")
         if self.order not in range(1, MOST_SECTIONS + 1):
             raise InputError(f"the order of a sensor is {self.order}; it must be a whole number from 1 to {MOST_SECTIONS}")
 
@@ -94,7 +94,7 @@ class ImuModel:
         ):  # fmt: skip
             _check_not_negative(f"the {name} of an IMU", getattr(self, name))
         if self.magnetometer_rate == 0.0:
-            raise InputError("the magnetometer_rate of an IMU is 0; it must be positive")
+            raise InputError("the magnetometer_rate of an IMU is 0; it must be positive: leave it out to read it in each cycle")
         if not self.delay < inf:
             raise InputError("the delay of an IMU is infinite; it must be finite")
         if self.dropout > 1.0:

@@ -449,6 +449,7 @@ def test_an_unknown_preset_names_the_presets() -> None:
         {"cross_axis": -0.01},
         {"drift": -1.0},
         {"bandwidth": -5.0},
+        {"bandwidth": 0.0},
         {"reach": -2.0},
         {"resolution": -0.1},
         {"noise": "loud"},
