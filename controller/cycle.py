@@ -39,6 +39,7 @@ from controller.estimation import (
 )
 from controller.estimation.integrity import commanded, rest
 from controller.estimation.integrity import stage as integrity
+from controller.estimation.integrity.gravity import spread_by_legs
 from controller.estimation.integrity.protection import end_level
 from controller.estimation.whole_mechanism import trust
 from controller.estimation.whole_mechanism.imu_errors import ERRORS
@@ -64,7 +65,7 @@ from plant.checks import check_rate
 from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
 from plant.encoders import EncoderModel
 from plant.errors import InputError
-from plant.imu_wiring import ALL_IMUS, IMU_COUNT
+from plant.imu_wiring import ALL_IMUS, IMU_COUNT, PLATFORM_IMU
 from plant.mechanism import LEGS, Mechanism
 from plant.mechanism.planar import PLANAR_LEGS
 from plant.pose import Array
@@ -418,7 +419,10 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         level = s.integrity.protection
         trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])
         trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance[1])
-        end_level(level, s.integrity.evidence, time.cycle * rig.period)
+        # Encoders show what the platform's IMU alone does not.
+        alone = s.imus.used[PLATFORM_IMU] != 0 and not s.encoders.counts.any()
+        by_legs = spread_by_legs(s.integrity.gravity, s.imus) if alone else 0.0
+        end_level(level, s.integrity.evidence, time.cycle * rig.period, by_legs)
     integrity.publish_level(p.integrity, s.integrity, rig, time, s.imus, s.pose)
     changed = s.integrity.contradicts != 0 and watch.judge_parity(
         p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid

@@ -53,8 +53,14 @@ _LASTING, _LASTING_EVALUATIONS = 0.36, 6
 """Evidence against an IMU that cannot be left out ends the run beyond this share of the limit, in so many evaluations in a row.
 """
 
+_SUSPECTED, _SUSPECTED_EVALUATIONS, _SUSPICION_EVALUATIONS = 0.25, 3, 20
+"""Beyond this share of the limit, in so many evaluations in a row, evidence makes an IMU suspected that cannot be left out. For
+so many more, no other IMU is left out. The pose follows an IMU that is needed. If this turns slowly, the pose is off for long,
+and at last a leg's IMU may seem to contradict the others more.
+"""
+
 _FIRST_COUNTED = 20
-"""From which evaluation on these three count: until then nothing has been learned, and what a calibration does not know, such
+"""From which evaluation on these four count: until then nothing has been learned, and what a calibration does not know, such
 as clocks of the IMUs' own, is left unexplained, above all at low rates.
 """
 
@@ -131,6 +137,8 @@ STATE = record_dtype(
     cleared_for=(np.int64, IMU_COUNT),  # in how many evaluations there has been little evidence against an IMU left out
     unexplained_for=np.int64,  # in how many more than one IMU has been wrong
     lasting_for=np.int64,  # in how many there has been evidence against an IMU that is needed
+    suspected_for=np.int64,  # in how many there has been enough to suspect it
+    suspicion=np.int64,  # for how many more it is suspected
     lasting=(np.float64, 2),  # what has lasted long enough to end a run, and its limit; 0 if nothing has
 )
 """What the rig has reported, and what lasts."""
@@ -402,8 +410,8 @@ def judge_evidence(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, integrity: Record, reference: Record, pid: Record
 ) -> bool:
     """After an evaluation of the evidence for faults of the present set of IMUs: take back IMUs that agree again. Else leave
-    out the IMU that the evidence blames, if it clearly blames this one alone and the rest agrees; wait for more if that is not
-    clear; else stop. Returns whether the set of IMUs has changed.
+    out the IMU that the evidence blames, if it clearly blames this one alone and the rest agrees, and none that is needed has
+    been suspected before; wait for more if that is not clear; else stop. Returns whether the set of IMUs has changed.
 
     Below the limit, stop if all IMUs share the error or one has it that cannot be left out, if evidence against that one lasts,
     or if three evaluations in a row leave too much unexplained.
@@ -444,7 +452,7 @@ def judge_evidence(
         return False
     clear = e.rival_evidence < e.imu_evidence - max(_CLEARLY * limit, _CLEARLY_OF_ALL * e.imu_evidence)
     rest_agrees = rest < _REST * limit + usual_rest
-    alone = clear and rest_agrees and e.evidence.of_learned == 0
+    alone = clear and rest_agrees and e.evidence.of_learned == 0 and w.suspicion == 0
     if alone and _may_leave_out(p.watch, imus, k):
         imus.excluded[k] = 1
         _count_anew(w)
@@ -460,12 +468,17 @@ def judge_evidence(
 
 @kernel
 def _count_evaluations(p: Record, w: Record, e: Record, rest: float, usual_rest: float) -> None:
-    """Count the evaluations in a row that leave too much unexplained, and those that are against an IMU that is needed."""
+    """Count the evaluations in a row that leave too much unexplained, and those that are against an IMU that is needed; and
+    remember that this is suspected.
+    """
     counts = e.evaluations >= _FIRST_COUNTED
     most_rest, most = _UNEXPLAINED * p.evidence + usual_rest, _LASTING * p.evidence
     w.unexplained_for = w.unexplained_for + 1 if counts and rest >= most_rest else 0
     lasts = e.best_evidence >= most and _is_needed(p, e.blamed)
     w.lasting_for = w.lasting_for + 1 if counts and lasts else 0
+    suspected = e.best_evidence >= _SUSPECTED * p.evidence and _is_needed(p, e.blamed)
+    w.suspected_for = w.suspected_for + 1 if counts and suspected else 0
+    w.suspicion = _SUSPICION_EVALUATIONS if w.suspected_for >= _SUSPECTED_EVALUATIONS else max(w.suspicion - 1, 0)
     w.lasting[:] = 0.0
     if w.unexplained_for >= _UNEXPLAINED_EVALUATIONS:
         w.lasting[0], w.lasting[1] = rest, most_rest
@@ -476,7 +489,7 @@ def _count_evaluations(p: Record, w: Record, e: Record, rest: float, usual_rest:
 @kernel
 def _count_anew(w: Record) -> None:
     """Count no evaluation of another set of IMUs."""
-    w.unexplained_for = w.lasting_for = 0
+    w.unexplained_for = w.lasting_for = w.suspected_for = w.suspicion = 0
     w.lasting[:] = 0.0
 
 

@@ -12,15 +12,19 @@ takes half at first. What is older than `_REFERENCE_S` is all in the mean. The g
 share show themselves here when the filters still take them for motion.
 
 With another set of IMUs, c is another one, and the drift is too large until the mean has followed.
+
+If the platform's IMU turns slowly on its mounting, the pose follows it, and only the legs show that. How well they do, the same
+sums of the legs alone tell.
 """
 
 import numpy as np
 
 from controller.estimation.integrity.evidence import POSE
 from controller.estimation.whole_mechanism.readings import READINGS
-from controller.least_squares import solve_square
+from controller.least_squares import invert_symmetric, solve_square
 from plant.compiled import Record, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT
+from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.vectors import dot, vector
 
@@ -42,6 +46,7 @@ STATE = record_dtype(
     age=np.float64,  # of the reference [s]
     reference=(np.float64, POSE),  # c [m, rad]
     system=(np.float64, (POSE, POSE)),  # scratch
+    inverse=(np.float64, (POSE, POSE)),  # scratch
     pose=(np.float64, POSE),  # scratch
     drifted=(np.float64, 2),  # by how much position [m] and rotation [rad] have drifted; 0 where gravity does not show the pose
 )
@@ -84,6 +89,21 @@ def compare_with_gravity(s: Record, filtered: Record, imus: Record, moves: bool)
     for part in range(2):
         drift = vector(s.pose[3 * part :])
         s.drifted[part] = np.sqrt(dot(drift, drift))
+
+
+@kernel
+def spread_by_legs(s: Record, imus: Record) -> float:
+    """The standard deviation of the rotation that the accelerometers of the legs show [rad]; 0 if they do not show the pose.
+
+    The sums fade exponentially, so the covariance of what they show is half the inverse of their information.
+    """
+    s.system[:] = 0.0
+    for k in range(LEGS):
+        if imus.used[k] != 0:
+            s.system += s.information[k]
+    if not invert_symmetric(s.system, s.inverse):
+        return 0.0
+    return float(np.sqrt(0.5 * (s.inverse[3, 3] + s.inverse[4, 4] + s.inverse[5, 5])))
 
 
 @kernel

@@ -15,7 +15,7 @@ the filter's memory than on average over it, and has moved the pose before, and 
 has grown already: the gyroscopes of IMUs that get warm together show a small error all the time. A fault since the loop began
 has had little time to move the pose: these terms grow over the first four seconds.
 
-The level is the root of the sum of the squares of nine terms:
+The level is the root of the sum of the squares of ten terms:
 
 1. The greatest of these.
 2. The standard deviation of the pose, both that of the closed form and that of the pose's own source if that is less: no filter
@@ -30,9 +30,11 @@ The level is the root of the sum of the squares of nine terms:
 8. How far the pose has drifted from the one that gravity shows, as `gravity` has it: so errors that all gyroscopes share show
    themselves while the filters still take them for motion.
 9. How far the platform may have crept at rest, as `rest` has it: there the IMUs need not show a slow error.
+10. How far a slow turn of the platform's IMU on its mounting could move the rotation unseen: several standard deviations of the
+   rotation that the legs' accelerometers alone show, as `gravity` has it. Like a fault, it grows over the first four seconds.
 
-Terms 3 to 9 are renewed in every cycle; terms 6 and 9 are those of the cycle before, and term 8 changes with the fault filter's
-windows. Term 2 counts more as soon as the evidence begins anew.
+Terms 1, 2 and 10 are those of the last evaluation. Terms 3 to 9 are renewed in every cycle; terms 6 and 9 are those of the
+cycle before, and term 8 changes with the fault filter's windows. Term 2 counts more as soon as the evidence begins anew.
 """
 
 import numpy as np
@@ -99,9 +101,14 @@ _OF_CREPT = 1.3
 _USUALLY_DRIFTED, _OF_DRIFTED = (0.3, 0.7), (3.0, 2.5)
 """The drift from what gravity shows counts beyond so many standard deviations of the closed form, so many times."""
 
+_WELL_SHOWN, _OF_TURN = 5e-4, 5.0
+"""The standard deviation of the rotation by the legs counts beyond the first [rad], so many times. With 2.1 mrad, as at 250 Hz,
+a slow turn of the platform's IMU turned the pose by up to 1 deg before it was told.
+"""
+
 STATE = record_dtype(
     level=(np.float64, 2),  # of position [m] and rotation [rad]
-    evaluated=(np.float64, 2),  # the square of its first term, of the last complete evaluation
+    evaluated=(np.float64, 2),  # the square of its first and its tenth term, of the last complete evaluation
     spread=(np.float64, 2),  # the square of its second, when the filters have settled
     closed=(np.float64, 2),  # square of the closed form's standard deviation then
     misfit=np.float64,  # of the closed form, averaged
@@ -188,13 +195,15 @@ def take_hypothesis(
 
 
 @kernel
-def end_level(s: Record, e: Record, age: float) -> None:
+def end_level(s: Record, e: Record, age: float, by_legs: float) -> None:
     """End an evaluation; the level is infinite where the readings do not determine the pose.
 
     Args:
         s: dtype `STATE`, with the covariances of the pose.
         e: dtype `evidence.STATE`. If the evaluation is about what was learned, the faults are those of the one before.
         age: for how long the loop has run [s].
+        by_legs: standard deviation of the rotation that the legs' accelerometers show [rad]; 0 where no slow turn of the
+            platform's IMU could move the pose.
     """
     bent = min(1.0, age / _BENDING_S)
     if e.of_learned == 0:
@@ -210,6 +219,7 @@ def end_level(s: Record, e: Record, age: float) -> None:
         s.closed[part] = closed if np.isfinite(closed) else 0.0
         s.spread[part] = spread if s.determined != 0 else 0.0
         s.evaluated[part] = (bent * s.fault[part]) ** 2 if s.determined != 0 else np.inf
+    s.evaluated[1] += (bent * _OF_TURN * max(by_legs - _WELL_SHOWN, 0.0)) ** 2
 
 
 @kernel

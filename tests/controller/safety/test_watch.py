@@ -739,6 +739,27 @@ def test_evidence_about_another_set_of_imus_does_not_last(change):
     assert evaluations_until_a_stop(parameters, state) == 6
 
 
+@pytest.mark.parametrize(
+    ("suspected", "evidence", "needed", "calm", "left_out"),
+    [(3, 4.1, 1, 0, False), (2, 4.1, 1, 0, True), (3, 3.9, 1, 0, True), (3, 4.1, 0, 0, True), (5, 4.1, 1, 18, False),
+     (5, 4.1, 1, 19, True)],
+)  # fmt: skip
+def test_no_imu_is_left_out_while_the_platforms_imu_is_suspected(suspected, evidence, needed, calm, left_out):
+    """The root of 0.25 x 64 in three evaluations in a row makes it suspected for two seconds, if the run needs it."""
+    _, parameters, state = moving()
+    state["imus"]["healthy"], state["integrity"]["evaluations"] = 1, 20
+    if not needed:
+        parameters["safety"]["watch"]["without_platform_imu"] = np.inf
+    for imu, found, evaluations in ((6, evidence, suspected), (2, 3.0, calm)):
+        weigh(state, imu, found, found)
+        assert evaluations == 0 or evaluations_until_a_stop(parameters, state, evaluations + 1) is None
+    weigh(state, 2, 9.0, 9.5)
+    assert judge(parameters, state) == left_out
+    assert int(state["imus"]["excluded"][2]) == left_out
+    if not left_out:
+        assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(9.0), pytest.approx(8.0))
+
+
 @pytest.mark.parametrize(("imu", "expected"), [(6, 1), (3, None)])
 def test_only_for_an_imu_that_may_be_left_out_more_evidence_is_awaited(imu, expected):
     """Something else explains the readings as well."""

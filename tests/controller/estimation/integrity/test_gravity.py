@@ -5,8 +5,8 @@ import pytest
 
 from controller.estimation.imu_health import STATE as IMUS
 from controller.estimation.integrity.fault_filter import STATE as FILTER_STATE
-from controller.estimation.integrity.gravity import STATE, compare_with_gravity
-from hil.faults.rows import all_rows
+from controller.estimation.integrity.gravity import STATE, compare_with_gravity, spread_by_legs
+from hil.faults.rows import all_rows, rows_of
 from hil.faults.trials import Trial, figures_of
 from tests.controller.estimation.integrity.made_up import RATE_HZ, constants, filtered, readings
 
@@ -72,6 +72,22 @@ def test_the_pose_is_that_of_batch_least_squares_over_all_windows():
     root = np.sqrt(np.concatenate(weights))
     expected = np.linalg.lstsq(root[:, None] * np.concatenate(rows), root * np.concatenate(rights), rcond=None)[0]
     np.testing.assert_allclose(s["reference"], expected, rtol=1e-9)
+
+
+def test_the_spread_by_the_legs_is_that_of_estimates_from_noise():
+    """It is that of least squares over the legs' accelerometers alone, as often as they are read with new noise."""
+    random = np.random.default_rng(6)
+    jacobian, sigma, seen = random.normal(size=(7, 3, 6)), 0.02, imus(lost=[4])
+    s, found, told = np.zeros((), STATE), [], 0.0
+    used = [0, 1, 2, 3, 5]
+    for i, f in enumerate(windows(jacobian, random.normal(size=(20000, 7, 3), scale=sigma))):
+        f["weight"] = 1.0 / sigma**2
+        compare_with_gravity(s[()], f, seen, False)
+        if i > 500 and i % 100 == 0:
+            told = spread_by_legs(s[()], seen)
+            found.append(np.linalg.solve(s["information"][used].sum(axis=0), s["vector"][used].sum(axis=0))[3:])
+    np.testing.assert_allclose(told, np.sqrt(np.mean(np.sum(np.square(found), axis=1))), rtol=0.1)
+    assert spread_by_legs(s[()], imus(lost=[0, 1, 2, 3, 4])) == 0.0
 
 
 def test_before_the_motion_and_where_gravity_does_not_show_the_pose_nothing_has_drifted():
@@ -147,4 +163,16 @@ def test_the_level_covers_gyroscopes_that_drift_so_slowly_that_nothing_is_told(f
     (row,) = (row for row in all_rows() if row.name == "all gyroscopes drift by 0.005 deg/s per second about x")
     found = figures_of(Trial(row, 3, fusion))
     assert not found["told"] and found["position_before"] > 0.8e-3
+    assert found["covered"] > 0.999 * found["cycles"]
+
+
+@pytest.mark.parametrize(
+    ("fusion", "rate", "seed", "turn"),
+    [("whole", 200, 6, "axis=x,size_deg=2,ramp_s=5"), ("compiled", 250, 7, "axis=1/1/0,size_deg=1,ramp_s=4")],
+)
+def test_the_level_covers_a_platform_imu_that_turns_so_slowly_that_it_is_told_late(fusion, rate, seed, turn):
+    """At low rates the legs show a rotation of the platform less well."""
+    (row,) = rows_of({"loosening": [{"name": "a turn", "faults": [f"imu-turn:6,{turn}"], "rate": rate, "duration": 14.0}]})
+    found = figures_of(Trial(row, seed, fusion))
+    assert found["told"] and found["rotation_before"] > 0.008
     assert found["covered"] > 0.999 * found["cycles"]

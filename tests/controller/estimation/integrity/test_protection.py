@@ -17,13 +17,13 @@ NOT = (0.0, 0.0)
 
 def ended(
     level, age=50.0, of_learned=0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, crept=NOT, apart=NOT,
-    drifted=NOT, settled=50.0,
+    drifted=NOT, settled=50.0, by_legs=0.0,
 ):  # fmt: skip
     """The level (2,) at the end of an evaluation, with a misfit that lasts."""
     level["covariance"], level["misfit"] = own, misfit
     evidence = np.zeros((), STATE)
     evidence["of_learned"] = of_learned
-    end_level(level[()], evidence[()], age)
+    end_level(level[()], evidence[()], age, by_legs)
     moves = (np.array(each) for each in (bent, moved, crept, apart, drifted))
     publish_level(level[()], settled, misfit, 0.01, steady, shaken, *moves)
     return level["level"].copy()
@@ -169,6 +169,16 @@ def test_a_drift_from_what_gravity_shows_raises_the_level_beyond_what_calibratio
     sound, usual = ended(level), np.array([0.3, 0.7]) * np.sqrt(next(iter(traces())))
     np.testing.assert_allclose(ended(level, drifted=0.999 * usual), sound, rtol=1e-12)
     np.testing.assert_allclose(ended(level, drifted=usual + [1e-3, 2e-3]), np.hypot(sound, [3e-3, 5e-3]))
+
+
+@pytest.mark.parametrize(("age", "share"), [(50.0, 1.0), (1.0, 0.25)])
+def test_a_rotation_that_the_legs_hardly_show_raises_the_level_of_the_rotation_alone(age, share):
+    _, state = evaluated()
+    level = state["integrity"]["protection"]
+    level["determined"] = 1
+    sound = ended(level, age)
+    np.testing.assert_array_equal(ended(level, age, by_legs=5e-4), sound)
+    np.testing.assert_allclose(ended(level, age, by_legs=2.5e-3), np.hypot(sound, [0.0, 0.01 * share]))
 
 
 def test_measurements_that_contradict_each_other_raise_the_level_between_evaluations():
