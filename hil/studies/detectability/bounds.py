@@ -90,7 +90,7 @@ def _signature(run: Disturbed) -> Array:
     config = run.config
     mechanism, motion, times = _motion(config.mechanism, config.target, config.duration, 1.0 / config.rate, -REST_S)
     stage = Stage(mechanism, _built(mechanism, config), load_imu(config.imu), config.seed, motion, times)
-    return signature(stage, run.faults, round(STEP_S * config.rate))
+    return signature(stage, run.faults, _cycles(config.rate))
 
 
 def _built(mechanism: Mechanism, config: SimulationConfig) -> Mechanism:
@@ -108,20 +108,28 @@ def _built(mechanism: Mechanism, config: SimulationConfig) -> Mechanism:
 def _motion(name: str, target: str, duration: float, period: float, first: float) -> tuple[Mechanism, Motion, Array]:
     """A mechanism, its motion along a target in every `period` [s], and these times, of which the first is `first` [s]."""
     mechanism = load_spatial(name)
-    times = first + period * np.arange(round((REST_S + duration) / period))
+    # What is left of a step at the end does not count; rounding must not take the last one.
+    times = first + period * np.arange(int((REST_S + duration) / period + 1e-6))
     return mechanism, motion_along(load_target(target, mechanism, duration), mechanism, times), times
 
 
 # Each takes 100 MB for 20 s.
 @lru_cache(maxsize=4)
 def _model(name: str, target: str, duration: float, imu: str, rate: float, uncertainty: Uncertainty) -> LinearModel:
-    mechanism, motion, _ = _motion(name, target, duration, STEP_S, 0.5 * STEP_S - REST_S)
-    return linear_model(mechanism, motion, load_imu(imu), rate, uncertainty, STEP_S)
+    step = _cycles(rate) / rate
+    mechanism, motion, _ = _motion(name, target, duration, step, 0.5 * step - REST_S)
+    return linear_model(mechanism, motion, load_imu(imu), rate, uncertainty, step)
+
+
+def _cycles(rate: float) -> int:
+    """Of a step of the model: so many take about `STEP_S`."""
+    return round(STEP_S * rate)
 
 
 def _bound(found: Whitened, data: Array, column: int, run: Disturbed) -> Bound:
     begin, needed = run.begin, needed_noncentrality(directions_of(run.faults))
-    ended = STEP_S * np.arange(1, len(found.estimates) + 1) - REST_S
+    rate = run.config.rate
+    ended = _cycles(rate) / rate * np.arange(1, len(found.estimates) + 1) - REST_S
     noncentrality = np.cumsum(np.sum(found.innovations[:, :, column] ** 2, axis=1))
     reached = bool(noncentrality[-1] >= needed)
     last = (

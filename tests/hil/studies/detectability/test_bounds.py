@@ -109,6 +109,15 @@ def test_a_larger_fault_is_told_sooner_and_the_least_scales_with_it():
     assert large.least_position == pytest.approx(small.least_position, rel=1e-6)
 
 
+@pytest.mark.parametrize("rate", [333.0, 130.0])
+def test_a_loop_of_which_20_ms_are_no_whole_number_of_cycles_has_about_the_same_bounds(rate):
+    text = "imu-offset:2,axis=y,size_m_per_s2=0.5,ramp_s=3,at=1.5"
+    there, beside = bounds_of(text, rate=rate), bounds_of(text, rate=50.0 * round(rate / 50.0))
+    assert there.told_after == pytest.approx(beside.told_after, abs=0.06)
+    assert there.least_position == pytest.approx(beside.least_position, rel=0.1)
+    assert there.sound_rotation == pytest.approx(beside.sound_rotation, rel=0.1)
+
+
 def test_a_fault_of_the_least_size_is_told_at_the_end_and_none_below():
     least = bounds_of("imu-offset:2,axis=x,size_m_per_s2=1,ramp_s=3,at=1.5").least
     for share, told in ((1.001, True), (0.999, False)):
