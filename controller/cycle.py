@@ -419,8 +419,8 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         level = s.integrity.protection
         trust.find_closed_covariance(s.pose, level.scratch, level.covariance[0])
         trust.find_covariance(p.mechanism, s.mechanism, rig, time, s.pose, level.scratch, level.covariance[1])
-        # Encoders show what the platform's IMU alone does not.
-        alone = s.imus.used[PLATFORM_IMU] != 0 and not s.encoders.counts.any()
+        # Encoders of all legs show what the platform's IMU alone does not.
+        alone = s.imus.used[PLATFORM_IMU] != 0 and not s.encoders.counts.all()
         by_legs = spread_by_legs(s.integrity.gravity, s.imus) if alone else 0.0
         end_level(level, s.integrity.evidence, time.cycle * rig.period, by_legs)
     integrity.publish_level(p.integrity, s.integrity, rig, time, s.imus, s.pose)

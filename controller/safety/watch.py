@@ -54,9 +54,9 @@ _LASTING, _LASTING_EVALUATIONS = 0.36, 6
 """
 
 _SUSPECTED, _SUSPECTED_EVALUATIONS, _SUSPICION_EVALUATIONS = 0.25, 3, 20
-"""Beyond this share of the limit, in so many evaluations in a row, evidence makes an IMU suspected that cannot be left out. For
-so many more, no other IMU is left out. The pose follows an IMU that is needed. If this turns slowly, the pose is off for long,
-and at last a leg's IMU may seem to contradict the others more.
+"""Beyond this share of the limit, in so many evaluations in a row, evidence makes an IMU suspected that cannot be left out.
+While the last number counts down, evaluation by evaluation, evidence leaves out no other IMU. The pose follows an IMU that is
+needed. If this turns slowly, the pose is off for long, and at last a leg's IMU may seem to contradict the others more.
 """
 
 _FIRST_COUNTED = 20
@@ -462,7 +462,10 @@ def judge_evidence(
     certain = ends or (clear and rest_agrees) or e.best_evidence >= _PATIENT * limit
     if certain or (judged and w.unexplained_for >= _UNEXPLAINED_EVALUATIONS):
         handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), most)
-        _report_rival(s, e, most)
+        if w.suspicion > 0 and k != PLATFORM_IMU:
+            report_event(s.events, Cause.RIVAL_IMU, PLATFORM_IMU, np.sqrt(_SUSPECTED * limit), most)
+        else:
+            _report_rival(s, e, most)
     return False
 
 
@@ -489,7 +492,7 @@ def _count_evaluations(p: Record, w: Record, e: Record, rest: float, usual_rest:
 @kernel
 def _count_anew(w: Record) -> None:
     """Count no evaluation of another set of IMUs."""
-    w.unexplained_for = w.lasting_for = w.suspected_for = w.suspicion = 0
+    w.unexplained_for = w.lasting_for = w.suspected_for = 0
     w.lasting[:] = 0.0
 
 

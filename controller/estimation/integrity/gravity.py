@@ -39,6 +39,9 @@ _LEAST_PIVOT = 1e-3
 0.01 and more on all presets.
 """
 
+_LEAST_LEGS, _MOST_SPREAD = 4, 0.02
+"""How well the legs show the rotation is only asked of so many or more, and at most so little is admitted [rad]."""
+
 STATE = record_dtype(
     information=(np.float64, (IMU_COUNT, POSE, POSE)),  # J^T W J of each IMU, sum
     vector=(np.float64, (IMU_COUNT, POSE)),  # J^T W z of each IMU, sum
@@ -93,17 +96,23 @@ def compare_with_gravity(s: Record, filtered: Record, imus: Record, moves: bool)
 
 @kernel
 def spread_by_legs(s: Record, imus: Record) -> float:
-    """The standard deviation of the rotation that the accelerometers of the legs show [rad]; 0 if they do not show the pose.
+    """The standard deviation of the rotation that the accelerometers of the legs show, at most `_MOST_SPREAD` [rad].
 
-    The sums fade exponentially, so the covariance of what they show is half the inverse of their information.
+    With fewer than `_LEAST_LEGS` it is 0: they do not show the pose at all, and nothing is said. The sums fade exponentially.
+    So the covariance of what they show is half the inverse of their information.
     """
+    used = 0
     s.system[:] = 0.0
     for k in range(LEGS):
         if imus.used[k] != 0:
+            used += 1
             s.system += s.information[k]
-    if not invert_symmetric(s.system, s.inverse):
+    if used < _LEAST_LEGS:
         return 0.0
-    return float(np.sqrt(0.5 * (s.inverse[3, 3] + s.inverse[4, 4] + s.inverse[5, 5])))
+    spread = np.inf
+    if invert_symmetric(s.system, s.inverse):
+        spread = np.sqrt(0.5 * (s.inverse[3, 3] + s.inverse[4, 4] + s.inverse[5, 5]))
+    return float(spread if spread < _MOST_SPREAD else _MOST_SPREAD)
 
 
 @kernel

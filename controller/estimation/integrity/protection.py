@@ -108,7 +108,7 @@ a slow turn of the platform's IMU turned the pose by up to 1 deg before it was t
 
 STATE = record_dtype(
     level=(np.float64, 2),  # of position [m] and rotation [rad]
-    evaluated=(np.float64, 2),  # the square of its first and its tenth term, of the last complete evaluation
+    evaluated=(np.float64, 2),  # the sum of the squares of its first and tenth terms, of the last evaluation
     spread=(np.float64, 2),  # the square of its second, when the filters have settled
     closed=(np.float64, 2),  # square of the closed form's standard deviation then
     misfit=np.float64,  # of the closed form, averaged
@@ -202,8 +202,8 @@ def end_level(s: Record, e: Record, age: float, by_legs: float) -> None:
         s: dtype `STATE`, with the covariances of the pose.
         e: dtype `evidence.STATE`. If the evaluation is about what was learned, the faults are those of the one before.
         age: for how long the loop has run [s].
-        by_legs: standard deviation of the rotation that the legs' accelerometers show [rad]; 0 where no slow turn of the
-            platform's IMU could move the pose.
+        by_legs: standard deviation of the rotation that the legs' accelerometers show [rad]; 0 where a slow turn of the
+            platform's IMU could not move the pose, or nothing is said about it.
     """
     bent = min(1.0, age / _BENDING_S)
     if e.of_learned == 0:

@@ -122,7 +122,7 @@ def _model(name: str, target: str, duration: float, imu: str, rate: float, uncer
 
 
 def _cycles(rate: float) -> int:
-    """Of a step of the model: so many take about `STEP_S`."""
+    """The number of cycles in a step of the model, which takes about `STEP_S`."""
     return round(STEP_S * rate)
 
 

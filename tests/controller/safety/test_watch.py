@@ -745,7 +745,7 @@ def test_evidence_about_another_set_of_imus_does_not_last(change):
      (5, 4.1, 1, 19, True)],
 )  # fmt: skip
 def test_no_imu_is_left_out_while_the_platforms_imu_is_suspected(suspected, evidence, needed, calm, left_out):
-    """The root of 0.25 x 64 in three evaluations in a row makes it suspected for two seconds, if the run needs it."""
+    """The root of 0.25 x 64 in three evaluations in a row makes it suspected for 19 more, if the run needs it."""
     _, parameters, state = moving()
     state["imus"]["healthy"], state["integrity"]["evaluations"] = 1, 20
     if not needed:
@@ -758,6 +758,21 @@ def test_no_imu_is_left_out_while_the_platforms_imu_is_suspected(suspected, evid
     assert int(state["imus"]["excluded"][2]) == left_out
     if not left_out:
         assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(9.0), pytest.approx(8.0))
+        assert told(state) == [Cause.IMUS_CONTRADICT, Cause.RIVAL_IMU]
+
+
+def test_the_platforms_imu_stays_suspected_when_another_one_is_taken_back():
+    _, parameters, state = moving()
+    integrity, evidence = state["integrity"], state["integrity"]["evidence"]
+    state["imus"]["healthy"], integrity["evaluations"], state["imus"]["excluded"][3] = 1, 20, 1
+    weigh(state, 6, 4.1, 5.0)
+    assert evaluations_until_a_stop(parameters, state, 4) is None
+    state["safety"]["watch"]["cleared_for"][3] = 5
+    evidence["apart"], evidence["order"][0], evidence["apart_evidence"][0] = 1, 3, 0.0
+    assert judge(parameters, state)
+    evidence["apart"] = 0
+    weigh(state, 2, 9.0, 9.5)
+    assert not judge(parameters, state)
 
 
 @pytest.mark.parametrize(("imu", "expected"), [(6, 1), (3, None)])

@@ -449,7 +449,6 @@ def test_an_unknown_preset_names_the_presets() -> None:
         {"cross_axis": -0.01},
         {"drift": -1.0},
         {"bandwidth": -5.0},
-        {"bandwidth": 0.0},
         {"reach": -2.0},
         {"resolution": -0.1},
         {"noise": "loud"},
@@ -459,6 +458,11 @@ def test_errors_of_a_sensor_are_checked(errors: dict[str, Any]) -> None:
     (name,) = errors
     with pytest.raises(InputError, match=f"the {name} of a sensor is"):
         SensorErrors(**errors)
+
+
+def test_a_bandwidth_of_zero_is_refused_with_what_to_do_instead():
+    with pytest.raises(InputError, match="the bandwidth of a sensor is 0; it must be positive: leave it out"):
+        SensorErrors(bandwidth=0.0)
 
 
 @pytest.mark.parametrize("seed", [-1, 2**63])
