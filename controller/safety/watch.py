@@ -53,10 +53,11 @@ _LASTING, _LASTING_EVALUATIONS = 0.36, 6
 """Evidence against an IMU that cannot be left out ends the run beyond this share of the limit, in so many evaluations in a row.
 """
 
-_SUSPECTED, _SUSPECTED_EVALUATIONS, _SUSPICION_EVALUATIONS = 0.25, 3, 20
-"""Beyond this share of the limit, in so many evaluations in a row, evidence makes an IMU suspected that cannot be left out.
-While the last number counts down, evaluation by evaluation, evidence leaves out no other IMU. The pose follows an IMU that is
-needed. If this turns slowly, the pose is off for long, and at last a leg's IMU may seem to contradict the others more.
+_SUSPECTED, _SUSPECTED_OF_BEST, _SUSPECTED_EVALUATIONS, _SUSPICION_EVALUATIONS = 0.25, 0.5, 3, 20
+"""Beyond the first share of the limit and the second of the most evidence, in so many evaluations in a row, evidence makes the
+platform's IMU suspected if it cannot be left out. While the last number counts down, evaluation by evaluation, evidence leaves
+out no other IMU. The pose follows the platform's IMU. If this turns slowly, the pose is off for long, and at last a leg's IMU
+may seem to contradict the others more.
 """
 
 _FIRST_COUNTED = 20
@@ -479,7 +480,8 @@ def _count_evaluations(p: Record, w: Record, e: Record, rest: float, usual_rest:
     w.unexplained_for = w.unexplained_for + 1 if counts and rest >= most_rest else 0
     lasts = e.best_evidence >= most and _is_needed(p, e.blamed)
     w.lasting_for = w.lasting_for + 1 if counts and lasts else 0
-    suspected = e.best_evidence >= _SUSPECTED * p.evidence and _is_needed(p, e.blamed)
+    least = max(_SUSPECTED * p.evidence, _SUSPECTED_OF_BEST * e.best_evidence)
+    suspected = e.platform_evidence >= least and _is_needed(p, PLATFORM_IMU)
     w.suspected_for = w.suspected_for + 1 if counts and suspected else 0
     w.suspicion = _SUSPICION_EVALUATIONS if w.suspected_for >= _SUSPECTED_EVALUATIONS else max(w.suspicion - 1, 0)
     w.lasting[:] = 0.0

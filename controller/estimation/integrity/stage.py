@@ -17,6 +17,7 @@ from controller.estimation.integrity import (
 from controller.estimation.integrity.hypotheses import (
     HYPOTHESES,
     OF_ONE_IMU,
+    Kind,
     directions_of,
     evidence_for,
     imu_of,
@@ -27,7 +28,7 @@ from controller.estimation.whole_mechanism.readings import find_frames
 from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
-from plant.dynamics.variables import IMU_COUNT
+from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.pose import Array
 
 PARAMETERS = record_dtype(
@@ -68,6 +69,7 @@ STATE = record_dtype(
     rival=np.int64,  # the one with the most evidence among those that do not blame the same IMU
     rival_evidence=np.float64,
     imu_evidence=np.float64,  # for the whole IMU that the best one blames
+    platform_evidence=np.float64,  # for the whole IMU of the platform
     all_evidence=np.float64,  # for faults of any kind
 )
 """State of the filter and of the evaluation, and what the last evaluation has found."""
@@ -258,6 +260,7 @@ def _compare(s: Record) -> None:
     s.shared = kind_of(s.best) - OF_ONE_IMU
     s.best_evidence, s.rival_evidence = s.found[s.best], -1.0
     s.imu_evidence = s.best_evidence
+    s.platform_evidence = s.found[IMU_COUNT * Kind.IMU + PLATFORM_IMU]
     for h in range(HYPOTHESES):
         if blamed >= 0 and imu_of(h) == blamed:
             s.imu_evidence = max(s.imu_evidence, s.found[h])

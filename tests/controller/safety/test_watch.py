@@ -629,9 +629,12 @@ def test_contradicting_evidence_ends_a_motion_and_a_controlled_stop_and_says_the
     assert told(state) == [Cause.IMUS_CONTRADICT, Cause.RIVAL_IMU]
 
 
-def weigh(state, imu, evidence, in_all, rival=0.0):
-    """Let an evaluation have found evidence in sigma: against an IMU, for faults of any kind, and for something else."""
+def weigh(state, imu, evidence, in_all, rival=0.0, platform=0.0):
+    """Let an evaluation have found evidence in sigma: against an IMU, for faults of any kind, for something else, and against
+    the platform's IMU if that is another one.
+    """
     integrity = state["integrity"]
+    integrity["platform_evidence"] = evidence**2 if imu == 6 else platform**2
     integrity["best_evidence"] = integrity["imu_evidence"] = evidence**2
     integrity["blamed"], integrity["all_evidence"] = imu, in_all**2
     integrity["rival_blamed"], integrity["rival_evidence"] = -1, rival**2
@@ -753,12 +756,23 @@ def test_no_imu_is_left_out_while_the_platforms_imu_is_suspected(suspected, evid
     for imu, found, evaluations in ((6, evidence, suspected), (2, 3.0, calm)):
         weigh(state, imu, found, found)
         assert evaluations == 0 or evaluations_until_a_stop(parameters, state, evaluations + 1) is None
-    weigh(state, 2, 9.0, 9.5)
+    weigh(state, 2, 9.0, 9.5, platform=5.0)
     assert judge(parameters, state) == left_out
     assert int(state["imus"]["excluded"][2]) == left_out
     if not left_out:
         assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(9.0), pytest.approx(8.0))
         assert told(state) == [Cause.IMUS_CONTRADICT, Cause.RIVAL_IMU]
+
+
+@pytest.mark.parametrize(("of_leg", "left_out"), [(6.0, False), (7.0, True)])
+def test_the_platforms_imu_is_suspected_if_a_legs_is_not_twice_as_likely(of_leg, left_out):
+    """At 4.5 sigma; the evidence is the square."""
+    _, parameters, state = moving()
+    state["imus"]["healthy"], state["integrity"]["evaluations"] = 1, 20
+    weigh(state, 2, of_leg, 7.5, platform=4.5)
+    assert evaluations_until_a_stop(parameters, state, 4) is None
+    weigh(state, 2, 9.0, 9.5)
+    assert judge(parameters, state) == left_out
 
 
 def test_the_platforms_imu_stays_suspected_when_another_one_is_taken_back():
