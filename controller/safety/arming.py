@@ -219,8 +219,9 @@ def _find_obstacle(
         return cause, blamed, np.sqrt(s.arming.evidence[most]), np.sqrt(p.watch.evidence)
     lasting = s.watch.lasting
     if lasting[1] > 0.0:
-        cause = Cause.NO_TRUST.value if integrity.blamed < 0 else Cause.NO_SENSORS.value
-        return cause, integrity.blamed, np.sqrt(lasting[0]), np.sqrt(lasting[1])
+        blamed = s.watch.lasting_imu
+        cause = Cause.NO_TRUST.value if blamed < 0 else Cause.NO_SENSORS.value
+        return cause, blamed, np.sqrt(lasting[0]), np.sqrt(lasting[1])
     level = integrity.protection.level
     for part, cause in enumerate((Cause.POSITION_UNSURE.value, Cause.ROTATION_UNSURE.value)):
         if integrity.evaluations > 0 and not level[part] <= p.watch.level[part]:

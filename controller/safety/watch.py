@@ -49,19 +49,20 @@ _ENDING = 0.66
 error, or it is of one that is needed. Leaving out an IMU takes more.
 """
 
-_LASTING, _LASTING_EVALUATIONS = 0.36, 6
-"""Evidence against an IMU that cannot be left out ends the run beyond this share of the limit, in so many evaluations in a row.
+_USUAL, _CONTRADICTED, _OF_BEST = 0.375, 0.75, 0.5
+"""A cumulative sum (E. S. Page, Biometrika 41, 1954) takes the evidence against the platform's IMU, in sigma. Each evaluation
+adds what it has beyond the first share of the limit, or takes off what it lacks. Beyond the second share the sum ends the run.
+Evidence of less than the last share of the most evidence (as a likelihood ratio) counts as none.
 """
 
-_SUSPECTED, _SUSPECTED_OF_BEST, _SUSPECTED_EVALUATIONS, _SUSPICION_EVALUATIONS = 0.25, 0.5, 3, 20
-"""Beyond the first share of the limit and the second of the most evidence, in so many evaluations in a row, evidence makes the
-platform's IMU suspected if it cannot be left out. While the last number counts down, evaluation by evaluation, evidence leaves
-out no other IMU. The pose follows the platform's IMU. If this turns slowly, the pose is off for long, and at last a leg's IMU
-may seem to contradict the others more.
+_SUSPECTED, _SUSPICION_EVALUATIONS = 0.375, 20
+"""The platform's IMU is suspected when the sum exceeds the first share of the limit, and for so many evaluations afterwards. In
+that time evidence leaves out no other IMU: the pose follows the platform's IMU, so if this turns slowly, the pose is off, and a
+leg's IMU may contradict the others more at last.
 """
 
 _FIRST_COUNTED = 20
-"""From which evaluation on these four count: until then nothing has been learned, and what a calibration does not know, such
+"""From which evaluation on these rules count: until then nothing has been learned, and what a calibration does not know, such
 as clocks of the IMUs' own, is left unexplained, above all at low rates.
 """
 
@@ -137,10 +138,10 @@ STATE = record_dtype(
     returns=(np.int64, IMU_COUNT),  # how often each IMU was taken back
     cleared_for=(np.int64, IMU_COUNT),  # in how many evaluations there has been little evidence against an IMU left out
     unexplained_for=np.int64,  # in how many more than one IMU has been wrong
-    lasting_for=np.int64,  # in how many there has been evidence against an IMU that is needed
-    suspected_for=np.int64,  # in how many there has been enough to suspect it
-    suspicion=np.int64,  # for how many more it is suspected
-    lasting=(np.float64, 2),  # what has lasted long enough to end a run, and its limit; 0 if nothing has
+    against_platform=np.float64,  # sum of the evidence against the platform's IMU, if that is needed [sigma]
+    suspicion=np.int64,  # for how many more evaluations it is suspected
+    lasting=(np.float64, 2),  # square of what has lasted long enough to end a run, and of its limit; 0 if nothing has
+    lasting_imu=np.int64,  # the IMU that it blames
 )
 """What the rig has reported, and what lasts."""
 
@@ -414,8 +415,8 @@ def judge_evidence(
     out the IMU that the evidence blames, if it clearly blames this one alone and the rest agrees, and none that is needed has
     been suspected before; wait for more if that is not clear; else stop. Returns whether the set of IMUs has changed.
 
-    Below the limit, stop if all IMUs share the error or one has it that cannot be left out, if evidence against that one lasts,
-    or if three evaluations in a row leave too much unexplained.
+    Below the limit, stop if all IMUs share the error or one has it that cannot be left out, if evidence against that one adds
+    up, or if three evaluations in a row leave too much unexplained.
     """
     w, limit, e = s.watch, p.watch.evidence, integrity
     back = False
@@ -443,13 +444,13 @@ def judge_evidence(
     if not e.best_evidence >= least:
         if judged and w.lasting[1] > 0.0:
             found, most = np.sqrt(w.lasting)
-            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, found, most)
-            _report_rival(s, e, most)
+            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, w.lasting_imu, found, most)
+            _report_rival(s, e, w.lasting_imu, most)
         return False
     if k < 0:
         cause = Cause.GYROSCOPES_SHARE + e.shared
         handle_cause(p, s, rig, time, reference, pid, cause, -1, np.sqrt(e.best_evidence), most)
-        _report_rival(s, e, most)
+        _report_rival(s, e, -1, most)
         return False
     clear = e.rival_evidence < e.imu_evidence - max(_CLEARLY * limit, _CLEARLY_OF_ALL * e.imu_evidence)
     rest_agrees = rest < _REST * limit + usual_rest
@@ -461,40 +462,39 @@ def judge_evidence(
         return True
     # Nothing is gained by waiting where the IMU cannot be left out.
     certain = ends or (clear and rest_agrees) or e.best_evidence >= _PATIENT * limit
-    if certain or (judged and w.unexplained_for >= _UNEXPLAINED_EVALUATIONS):
+    if certain or (judged and w.lasting[1] > 0.0):
         handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), most)
-        if w.suspicion > 0 and k != PLATFORM_IMU:
-            report_event(s.events, Cause.RIVAL_IMU, PLATFORM_IMU, np.sqrt(_SUSPECTED * limit), most)
-        else:
-            _report_rival(s, e, most)
+        _report_rival(s, e, k, most)
     return False
 
 
 @kernel
 def _count_evaluations(p: Record, w: Record, e: Record, rest: float, usual_rest: float) -> None:
-    """Count the evaluations in a row that leave too much unexplained, and those that are against an IMU that is needed; and
-    remember that this is suspected.
+    """Count the evaluations in a row that leave too much unexplained; and add up the evidence against the platform's IMU, if it
+    is needed.
     """
-    counts = e.evaluations >= _FIRST_COUNTED
-    most_rest, most = _UNEXPLAINED * p.evidence + usual_rest, _LASTING * p.evidence
+    counts, sigma = e.evaluations >= _FIRST_COUNTED, np.sqrt(p.evidence)
+    most_rest, most = _UNEXPLAINED * p.evidence + usual_rest, _CONTRADICTED * sigma
     w.unexplained_for = w.unexplained_for + 1 if counts and rest >= most_rest else 0
-    lasts = e.best_evidence >= most and _is_needed(p, e.blamed)
-    w.lasting_for = w.lasting_for + 1 if counts and lasts else 0
-    least = max(_SUSPECTED * p.evidence, _SUSPECTED_OF_BEST * e.best_evidence)
-    suspected = e.platform_evidence >= least and _is_needed(p, PLATFORM_IMU)
-    w.suspected_for = w.suspected_for + 1 if counts and suspected else 0
-    w.suspicion = _SUSPICION_EVALUATIONS if w.suspected_for >= _SUSPECTED_EVALUATIONS else max(w.suspicion - 1, 0)
+    found = e.platform_evidence if e.platform_evidence >= _OF_BEST * e.best_evidence else 0.0
+    beyond = np.sqrt(max(found, 0.0)) - _USUAL * sigma
+    # What adds up on the brakes may delay arming by a limited time only.
+    added = min(max(w.against_platform + beyond, 0.0), 2.0 * most)
+    w.against_platform = added if counts and _is_needed(p, PLATFORM_IMU) else 0.0
+    suspected = w.against_platform >= _SUSPECTED * sigma
+    w.suspicion = _SUSPICION_EVALUATIONS if suspected else max(w.suspicion - 1, 0)
     w.lasting[:] = 0.0
     if w.unexplained_for >= _UNEXPLAINED_EVALUATIONS:
-        w.lasting[0], w.lasting[1] = rest, most_rest
-    elif w.lasting_for >= _LASTING_EVALUATIONS:
-        w.lasting[0], w.lasting[1] = e.imu_evidence, most
+        w.lasting[0], w.lasting[1], w.lasting_imu = rest, most_rest, e.blamed
+    elif w.against_platform >= most:
+        w.lasting[0], w.lasting[1], w.lasting_imu = w.against_platform**2, most**2, PLATFORM_IMU
 
 
 @kernel
 def _count_anew(w: Record) -> None:
     """Count no evaluation of another set of IMUs."""
-    w.unexplained_for = w.lasting_for = w.suspected_for = 0
+    w.unexplained_for = 0
+    w.against_platform = 0.0
     w.lasting[:] = 0.0
 
 
@@ -514,13 +514,20 @@ def _may_leave_out(p: Record, imus: Record, k: int) -> bool:
 
 
 @kernel
-def _report_rival(s: Record, e: Record, limit: float) -> None:
-    """Say what else explains the readings nearly as well."""
-    if e.rival_evidence < _NEARLY * e.best_evidence:
+def _report_rival(s: Record, e: Record, named: int, limit: float) -> None:
+    """Say what else may be wrong than the IMU that has been named (-1: none): what has more evidence, the platform's IMU if it
+    is suspected, or what explains the readings nearly as well.
+    """
+    if named != e.blamed:
+        k, shared, found = e.blamed, e.shared, e.best_evidence
+    elif named >= 0 and named != PLATFORM_IMU and s.watch.suspicion > 0:
+        k, shared, found = PLATFORM_IMU, 0, e.platform_evidence
+    elif e.rival_evidence >= _NEARLY * e.best_evidence:
+        k, shared, found = e.rival_blamed, e.rival_shared, e.rival_evidence
+    else:
         return
-    k = e.rival_blamed
-    cause = Cause.RIVAL_IMU if k >= 0 else Cause.RIVAL_GYROSCOPES + e.rival_shared
-    report_event(s.events, cause, k, np.sqrt(e.rival_evidence), limit)
+    cause = Cause.RIVAL_IMU if k >= 0 else Cause.RIVAL_GYROSCOPES + shared
+    report_event(s.events, cause, k, np.sqrt(found), limit)
 
 
 @kernel

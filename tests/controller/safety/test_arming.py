@@ -240,7 +240,7 @@ def test_evidence_below_its_limit_that_lasts_prevents_arming(hexapod, blamed):
     bench.steps(bench.hold - 1)
     lasting = bench.state["safety"]["watch"]["lasting"]
     lasting[:] = 25.0, 24.0
-    bench.state["integrity"]["blamed"] = blamed
+    bench.state["safety"]["watch"]["lasting_imu"] = blamed
     bench.steps(2)
     assert bench.mode == Mode.IDLE
     cause = Cause.NO_TRUST if blamed < 0 else Cause.NO_SENSORS
