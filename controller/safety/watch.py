@@ -51,13 +51,13 @@ error, or it is of one that is needed. Leaving out an IMU takes more.
 
 _USUAL, _CONTRADICTED, _OF_BEST = 0.375, 0.75, 0.5
 """A cumulative sum (E. S. Page, Biometrika 41, 1954) takes the evidence against the platform's IMU, in sigma. Each evaluation
-adds what it has beyond the first share of the limit, or takes off what it lacks. Beyond the second share the sum ends the run.
-Evidence of less than the last share of the most evidence (as a likelihood ratio) counts as none.
+adds what it has beyond the first share of the limit (in sigma, too), or takes off what it lacks. From the second share on, the
+sum ends the run. Evidence of less than the last share of the most evidence (both are squares of sigma) counts as none.
 """
 
 _SUSPECTED, _SUSPICION_EVALUATIONS = 0.375, 20
-"""The platform's IMU is suspected when the sum exceeds the first share of the limit, and for so many evaluations afterwards. In
-that time evidence leaves out no other IMU: the pose follows the platform's IMU, so if this turns slowly, the pose is off, and a
+"""The platform's IMU is suspected from this share of the limit on, for so many evaluations from the last such one on. In that
+time evidence leaves out no other IMU: the pose follows the platform's IMU, so if this turns slowly, the pose is off, and a
 leg's IMU may contradict the others more at last.
 """
 
@@ -440,31 +440,29 @@ def judge_evidence(
     k = e.blamed
     ends = k < 0 or _is_needed(p.watch, k)
     least = _ENDING * limit if ends and judged and e.evaluations >= _FIRST_COUNTED else limit
-    most = np.sqrt(least)
-    if not e.best_evidence >= least:
-        if judged and w.lasting[1] > 0.0:
-            found, most = np.sqrt(w.lasting)
-            handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, w.lasting_imu, found, most)
-            _report_rival(s, e, w.lasting_imu, most)
-        return False
-    if k < 0:
+    seen, most = e.best_evidence >= least, np.sqrt(least)
+    if seen and k < 0:
         cause = Cause.GYROSCOPES_SHARE + e.shared
         handle_cause(p, s, rig, time, reference, pid, cause, -1, np.sqrt(e.best_evidence), most)
-        _report_rival(s, e, -1, most)
+        _report_rival(s, e, -1)
         return False
     clear = e.rival_evidence < e.imu_evidence - max(_CLEARLY * limit, _CLEARLY_OF_ALL * e.imu_evidence)
     rest_agrees = rest < _REST * limit + usual_rest
     alone = clear and rest_agrees and e.evidence.of_learned == 0 and w.suspicion == 0
-    if alone and _may_leave_out(p.watch, imus, k):
+    if seen and alone and _may_leave_out(p.watch, imus, k):
         imus.excluded[k] = 1
         _count_anew(w)
         report_event(s.events, Cause.IMU_CONTRADICTED, k, np.sqrt(e.imu_evidence), most)
         return True
     # Nothing is gained by waiting where the IMU cannot be left out.
     certain = ends or (clear and rest_agrees) or e.best_evidence >= _PATIENT * limit
-    if certain or (judged and w.lasting[1] > 0.0):
+    if seen and certain:
         handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, k, np.sqrt(e.imu_evidence), most)
-        _report_rival(s, e, k, most)
+        _report_rival(s, e, k)
+    elif judged and w.lasting[1] > 0.0:
+        found, most = np.sqrt(w.lasting)
+        handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, w.lasting_imu, found, most)
+        _report_rival(s, e, w.lasting_imu)
     return False
 
 
@@ -514,20 +512,21 @@ def _may_leave_out(p: Record, imus: Record, k: int) -> bool:
 
 
 @kernel
-def _report_rival(s: Record, e: Record, named: int, limit: float) -> None:
-    """Say what else may be wrong than the IMU that has been named (-1: none): what has more evidence, the platform's IMU if it
-    is suspected, or what explains the readings nearly as well.
+def _report_rival(s: Record, e: Record, named: int) -> None:
+    """Say what else may be wrong than the IMU that has been named (-1: all share the error): what has more evidence, the
+    platform's IMU if it is suspected and a leg's has been named, or what explains the readings nearly as well.
     """
     if named != e.blamed:
         k, shared, found = e.blamed, e.shared, e.best_evidence
     elif named >= 0 and named != PLATFORM_IMU and s.watch.suspicion > 0:
-        k, shared, found = PLATFORM_IMU, 0, e.platform_evidence
+        # The evidence that has made it suspected may be gone.
+        k, shared, found = PLATFORM_IMU, 0, np.nan
     elif e.rival_evidence >= _NEARLY * e.best_evidence:
         k, shared, found = e.rival_blamed, e.rival_shared, e.rival_evidence
     else:
         return
     cause = Cause.RIVAL_IMU if k >= 0 else Cause.RIVAL_GYROSCOPES + shared
-    report_event(s.events, cause, k, np.sqrt(found), limit)
+    report_event(s.events, cause, k, np.sqrt(found), np.nan)
 
 
 @kernel

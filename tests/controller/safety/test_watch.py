@@ -640,6 +640,13 @@ def weigh(state, imu, evidence, in_all, rival=0.0, platform=0.0):
     integrity["rival_blamed"], integrity["rival_evidence"] = -1, rival**2
 
 
+def rival_of(state):
+    """IMU and evidence of the last event."""
+    events = state["safety"]["events"]
+    last = int(events["count"]) - 1
+    return int(events["index"][last]), float(events["value"][last])
+
+
 def evaluations_until_a_stop(parameters, state, most=30):
     for n in range(1, most):
         assert not judge(parameters, state)
@@ -723,8 +730,26 @@ def test_a_sum_that_ends_a_motion_does_so_beside_more_evidence_that_names_no_imu
     state["integrity"]["evaluations"] = 20
     weigh(state, 2, 8.5, 9.0, rival=8.4, platform=6.2)
     assert evaluations_until_a_stop(parameters, state) == 2
-    assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(8.5), pytest.approx(8.0))
+    assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(6.4), pytest.approx(6.0))
+    assert rival_of(state) == (2, pytest.approx(8.5))
     assert told(state) == [Cause.IMUS_CONTRADICT, Cause.RIVAL_IMU]
+
+
+def test_a_sum_that_grew_on_the_brakes_delays_arming_by_a_limited_time():
+    """It is kept below twice its limit, and 2 sigma take off 1 each time."""
+    _, parameters, state = moving(mode=Mode.IDLE)
+    watch = state["safety"]["watch"]
+    state["integrity"]["evaluations"] = 20
+    weigh(state, 3, 9.0, 9.0, platform=8.0)
+    for _ in range(100):
+        assert not judge(parameters, state)
+    assert watch["lasting"][1] == pytest.approx(36.0) and watch["lasting_imu"] == 6 and told(state) == []
+    weigh(state, 6, 2.0, 2.0)
+    lasted = 0
+    while watch["lasting"][1] > 0.0:
+        judge(parameters, state)
+        lasted += 1
+    assert lasted == 7
 
 
 @pytest.mark.parametrize(
@@ -796,6 +821,8 @@ def test_no_imu_is_left_out_while_the_platforms_imu_is_suspected(suspected, evid
     assert int(state["imus"]["excluded"][2]) == left_out
     if not left_out:
         assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(9.0), pytest.approx(8.0))
+        # The evidence of before is over.
+        assert rival_of(state) == (6, pytest.approx(np.nan, nan_ok=True))
         assert told(state) == [Cause.IMUS_CONTRADICT, Cause.RIVAL_IMU]
 
 
