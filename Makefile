@@ -5,7 +5,7 @@ BIN := .venv/bin
 OUT := out
 # One more than two processors: many tests wait.
 WORKERS ?= 3
-# Of the slow tests: 1/5 to 5/5 for a fifth of them.
+# Of the slow tests: 1/6 to 6/6 for a sixth of them.
 PART ?= 1/1
 
 comma := ,
