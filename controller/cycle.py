@@ -491,9 +491,9 @@ def _watch(parameters: Record, state: Record) -> int:
         rest.compare_at_rest(
             s.integrity.rest, rig, elapsed(rig, time), follows_commands(s.safety), s.encoders.counts.any(),
             s.integrity.commanded.rate, p.load.droop, s.load.drive, s.integrity.parity.twist,
-            2 * s.safety.watch.used_imus + s.mechanism.trusted, pose, s.reference,
+            s.integrity.protection.covariance[0], 2 * s.safety.watch.used_imus + s.mechanism.trusted, pose, s.reference,
         )  # fmt: skip
-        watch.check_rest(p.safety, s.safety, rig, time, s.integrity.rest.both, s.reference, s.pid)
+        watch.check_rest(p.safety, s.safety, rig, time, s.integrity.rest, s.reference, s.pid)
     if follows_commands(s.safety):
         watch.check_oscillation(
             p.safety, s.safety, rig, time, s.imus.shaking, s.load.feed_forward, s.reference, s.pid

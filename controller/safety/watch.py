@@ -4,7 +4,6 @@ import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
 from controller.estimation.integrity.parity import OF_TWO, SHARED
-from controller.estimation.integrity.rest import AT_REST
 from controller.rig import elapsed
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
@@ -345,13 +344,13 @@ def check_level(p: Record, s: Record, rig: Record, time: Record, level: Array, r
 
 
 @kernel
-def check_rest(p: Record, s: Record, rig: Record, time: Record, both: float, reference: Record, pid: Record) -> None:
-    """At rest: stop when commands and gyroscopes show a motion of the platform, as `rest` has it [m RMS of the legs].
+def check_rest(p: Record, s: Record, rig: Record, time: Record, rest: Record, reference: Record, pid: Record) -> None:
+    """At rest: stop when commands and gyroscopes show a motion of the platform beyond the limit of `rest` [m RMS of the legs].
 
     If `evidence` has no limit, nothing happens.
     """
-    if s.mode == Mode.RUNNING and both > AT_REST and np.isfinite(p.watch.evidence):
-        handle_cause(p, s, rig, time, reference, pid, Cause.MOVES_AT_REST, -1, both, AT_REST)
+    if s.mode == Mode.RUNNING and rest.both > rest.limit and np.isfinite(p.watch.evidence):
+        handle_cause(p, s, rig, time, reference, pid, Cause.MOVES_AT_REST, -1, rest.both, rest.limit)
 
 
 @kernel

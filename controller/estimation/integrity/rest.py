@@ -41,8 +41,11 @@ _FADING_S = 5.0
 _WARMING_S, _ADDED_S = 20.0, 5.0
 """Time constants of the gyroscopes' mean later on, and of the sums of a motion at rest [s]."""
 
-AT_REST = 2e-3
-"""A motion at rest that is told [m RMS of the legs]."""
+_TOLD, _OF_SPREAD, _LONG_S = 2e-3, 4.0, 2e-3
+"""A motion at rest is told beyond the first [m RMS of the legs], and beyond so many standard deviations of the lengths, as the
+pose in closed form has them: while the estimate settles, the loop moves the platform by what it errs. In periods longer than
+the last [s], noise aliases more than that says, by the root of their ratio.
+"""
 
 _COMMANDS, _GYROSCOPES, _WAYS = 0, 1, 2
 _TWIST = 6
@@ -57,6 +60,7 @@ STATE = record_dtype(
     mean=(np.float64, (_WAYS, LEGS)),  # rate of each leg, by commands and by gyroscopes, when it stands still [m/s]
     moved=(np.float64, (_WAYS, LEGS)),  # the sums of a motion at rest [m]
     both=np.float64,  # what is in both, RMS of the legs [m]
+    limit=np.float64,  # beyond which that is told [m]
     jacobian=(np.float64, (6, 6)),  # from here on scratch
     rates=(np.float64, (_WAYS, LEGS)),  # of the legs [m/s]
     motion=(np.float64, _TWIST),  # of the platform
@@ -68,7 +72,7 @@ STATE = record_dtype(
 @kernel
 def compare_at_rest(
     s: Record, rig: Record, duration: float, follows: bool, measured: bool, commanded: Array, droop: float, drive: Array,
-    twist: Array, source: int, pose: Record, reference: Record,
+    twist: Array, covariance: Array, source: int, pose: Record, reference: Record,
 ) -> None:  # fmt: skip
     """After the commands of a cycle: add up what they and the gyroscopes say of a motion at rest.
 
@@ -80,6 +84,7 @@ def compare_at_rest(
         commanded: (6,), rate of each leg as it was commanded, after the lag [m/s].
         droop, drive: droop [m/s/N] and load of each leg (6,) [N]: their product is the load's share.
         twist: (6,), of the platform beyond the planned one, that fits all gyroscopes [m/s, rad/s].
+        covariance: (6, 6), of the pose in closed form [m, rad].
         source: a number for what the pose comes from: IMUs and filter.
     """
     still = follows and not measured
@@ -102,6 +107,8 @@ def compare_at_rest(
         s.rates[_GYROSCOPES, k] = 0.0
         for i in range(_TWIST):
             s.rates[_GYROSCOPES, k] += s.jacobian[k, i] * twist[i]
+    spread = _spread_of_lengths(s.jacobian, covariance, rig.legs) * np.sqrt(max(1.0, rig.period / _LONG_S))
+    s.limit = max(_TOLD, _OF_SPREAD * spread) if np.isfinite(spread) else _TOLD
     _add_motion(s, rig, duration)
     _add_creep(s, rig, duration)
 
@@ -134,6 +141,17 @@ def _add_motion(s: Record, rig: Record, duration: float) -> None:
     for k in range(rig.legs):
         both += s.moved[_COMMANDS, k] * s.moved[_GYROSCOPES, k]
     s.both = max(both, 0.0) / (size * np.sqrt(rig.legs)) if size > 0.0 else 0.0
+
+
+@kernel
+def _spread_of_lengths(jacobian: Array, covariance: Array, legs: int) -> float:
+    """The standard deviation [m] of the lengths of a pose with this covariance (6, 6), RMS of the legs."""
+    total = 0.0
+    for k in range(legs):
+        for i in range(_TWIST):
+            for j in range(_TWIST):
+                total += jacobian[k, i] * covariance[i, j] * jacobian[k, j]
+    return float(np.sqrt(max(total, 0.0) / legs))
 
 
 @kernel

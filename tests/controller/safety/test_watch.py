@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from controller.cycle import hear_rig
-from controller.estimation.integrity.rest import AT_REST
 from controller.inverse_kinematics import leg_lengths
 from controller.safety import watch_nothing
 from controller.safety.causes import Cause, DriveState, Mode, Request
@@ -886,9 +885,11 @@ def test_a_motion_at_rest_ends_a_run_that_is_judged(both, mode, evidence, stops)
     _, parameters, state = moving(mode=mode)
     p, s = parameters, state
     p["safety"]["watch"]["evidence"] = evidence
-    check_rest(p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], both, s["reference"][()], s["pid"][()])
+    rest = s["integrity"]["rest"]
+    rest["both"], rest["limit"] = both, 2e-3
+    check_rest(p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], rest[()], s["reference"][()], s["pid"][()])
     if stops:
-        assert stop_of(state) == (Cause.MOVES_AT_REST, -1, both, AT_REST)
+        assert stop_of(state) == (Cause.MOVES_AT_REST, -1, both, 2e-3)
     else:
         assert state["safety"]["stop"]["cause"] == Cause.NONE
 

@@ -26,7 +26,7 @@ class Resting:
 
     def __init__(self, mechanism="hexapod"):
         self.mechanism, self.parameters, self.state = moving(mechanism)
-        self.loads = np.zeros(6)
+        self.loads, self.covariance = np.zeros(6), np.zeros((6, 6))
 
     def run(self, seconds, commands=0.0, twist=0.0, follows=True, measured=False, source=0):
         """Cycles with these commands of all legs [m/s] and this twist that the gyroscopes show."""
@@ -35,7 +35,7 @@ class Resting:
         for _ in range(round(seconds / PERIOD_S)):
             compare_at_rest(
                 self.rest[()], self.parameters["rig"][()], PERIOD_S, follows, measured, commanded, DROOP, self.loads, twist,
-                source, s["pose"][()], s["reference"][()],
+                self.covariance, source, s["pose"][()], s["reference"][()],
             )  # fmt: skip
 
     @property
@@ -169,6 +169,23 @@ def test_when_the_pose_comes_from_other_imus_a_motion_is_forgotten_and_the_creep
     loop.run(1.0, rates, twist, source=1)
     assert loop.rest["both"] == pytest.approx(1.6e-3, rel=0.2)
     assert loop.crept[0] > crept[0] + 1.5e-3
+
+
+@pytest.mark.parametrize("mechanism", ["hexapod", "6-4-II"])
+def test_what_is_told_grows_with_what_is_not_known_of_the_lengths(mechanism):
+    """The standard deviation of the lengths, by poses that are drawn with the covariance."""
+    loop, rng = Resting(mechanism), np.random.default_rng(5)
+    loop.run(0.1)
+    assert loop.rest["limit"] == 2e-3
+    factor = 4.0 * np.sqrt(PERIOD_S / 2e-3)
+    root = np.diag([1e-3] * 3 + [8e-3] * 3) @ rng.standard_normal((6, 6))
+    loop.covariance = root @ root.T
+    loop.run(0.1)
+    rates = [loop.rates_of(root @ rng.standard_normal(6)) for _ in range(2000)]
+    assert loop.rest["limit"] == pytest.approx(factor * np.sqrt(np.mean(np.square(rates))), rel=0.05)
+    loop.covariance = np.full((6, 6), np.inf)
+    loop.run(0.1)
+    assert loop.rest["limit"] == 2e-3
 
 
 HEIGHT = "imu-offset:legs,axis=0/0.89/-0.46,size_m_per_s2={size},ramp_s={within},at=4"
