@@ -24,13 +24,14 @@ def test_every_command_is_one() -> None:
         parse(words)
 
 
-def test_the_example_is_read() -> None:
-    (toml,) = re.findall("```toml\n(.*?)```", PAGE, re.DOTALL)
-    first, second = rows_of(tomllib.loads(toml))
+def test_the_examples_are_read() -> None:
+    tables = re.findall("```toml\n(.*?)```", PAGE, re.DOTALL)
+    (first, second), (turned,) = (rows_of(tomllib.loads(each)) for each in tables)
     assert (first.name, second.name) == tuple(f"a leg's IMU turns by {size} deg about x within 15 s" for size in (1, 3))
     drawn = first.drawn(0, "whole")
     assert drawn.config.settings[0].at == drawn.begin + 1.0 and len(drawn.guilty) == 1
     assert 8.0 <= drawn.begin <= 10.0
+    assert {turned.drawn(seed, "whole").config.rate for seed in range(9)} == {250, 1000}
 
 
 def test_the_figures_are_those_of_a_run() -> None:
@@ -38,7 +39,7 @@ def test_the_figures_are_those_of_a_run() -> None:
     records["mode"], records["truth"][:, 3], records["rotation"] = 2, 1.0, np.eye(3)
     figures = judge(records, 0, frozenset(), 1, 1.0)
     named = {name for line in re.findall(r"^\| (`.*?) \|", PAGE, re.MULTILINE) for name in re.findall(r"`(\w+)`", line)}
-    assert named | {"events"} == {*figures}
+    assert named | {"events"} == {"what", *figures}
 
 
 def test_the_table_has_every_row() -> None:

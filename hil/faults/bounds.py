@@ -110,6 +110,8 @@ def _bounds_of(row: Row, seeds: int, uncertainty: Uncertainty) -> RowBounds:
     drawn = [row.drawn(seed, "whole") for seed in range(seeds)]
     if row.base_imu or row.lengths != NO_LENGTHS:
         return RowBounds(row, bool(drawn[0].guilty), reason="the test has neither lengths nor an IMU on the base")
+    if row.draw:
+        return RowBounds(row, bool(drawn[0].guilty), reason="every seed draws another disturbance")
     try:
         bounds = find_bounds([Disturbed(each.config, each.faults, each.begin) for each in drawn], uncertainty)
     except NoSignatureError as error:

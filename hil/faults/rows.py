@@ -2,8 +2,8 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from dataclasses import MISSING, dataclass, fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -31,6 +31,9 @@ SOUND = "sound"
 ENCODERS = "encoders"
 """The kind of rows with encoders."""
 
+DRAWN = ("mechanism", "target", "imu", "rate", "joint_error")
+"""What of a row a seed may draw."""
+
 MOST_LATE = 5
 """A cycle that begins late does so by so many periods at most."""
 
@@ -54,6 +57,8 @@ class Row:
         lengths, base_imu: the added sensors, as in `SimulationConfig`.
         late_percent: share of the cycles that begin one to `MOST_LATE` periods late, as on a busy machine [%].
         guilty: the IMUs that may rightly be left out; None for those that have a disturbance alone, or with a few others.
+        sizes: bounds of {size}, which every seed draws on a logarithmic scale; none if there is nothing to draw.
+        draw: choices by name, of which every seed draws one each. They stand for {name}; those of `DRAWN` replace the above.
     """
 
     name: str
@@ -75,19 +80,29 @@ class Row:
     base_imu: bool = False
     late_percent: float = 0.0
     guilty: tuple[int, ...] | None = None
+    sizes: tuple[float, ...] = ()
+    draw: Mapping[str, Sequence[Any]] = field(default_factory=dict, hash=False)
 
     def drawn(self, seed: int, fusion: str) -> "Drawn":
-        """What a seed makes of the row: IMUs, place, sign and time."""
+        """What a seed makes of the row: IMUs, place, sign and time, and what else it draws."""
         random = np.random.default_rng([seed, crc32(self.name.encode())])
         at = round(self.earliest + (self.latest - self.earliest) * random.random(), 3)
         k, j, i = random.permutation(LEGS)[:3].tolist()
         values = {"k": k, "j": j, "i": i, "sign": "-" if random.random() < 0.5 else ""}
         values |= {"at": at} | {f"at{n}": round(at + n, 3) for n in (1, 2, 3)}
+        if self.sizes:
+            values["size"] = f"{np.exp(random.uniform(*np.log(self.sizes))):.3g}"
+        chosen = {name: choices[int(random.integers(len(choices)))] for name, choices in self.draw.items()}
+        values |= {name: str(choice).format_map(values) for name, choice in chosen.items()}
+        of_row = replace(self, draw={}, **{name: choice for name, choice in chosen.items() if name in DRAWN})
+        return of_row._run(values, at, random, seed, fusion)
+
+    def _run(self, values: Mapping[str, Any], at: float, random: np.random.Generator, seed: int, fusion: str) -> "Drawn":
         texts = " ".join(self.faults).format_map(values).split()
         faults = tuple(text if re.search(r",at(_s)?=", text) else f"{text},at={at:g}" for text in texts)
         settings = [Setting.parse(text.format_map(values)) for text in self.settings]
         if self.base_bend_mm or self.joint_off_mm:
-            settings.append(self._base_joints(k, random))
+            settings.append(self._base_joints(values["k"], random))
         config = SimulationConfig(
             mechanism=self.mechanism, target=self.target, duration=self.duration, rate=self.rate, imu=self.imu, seed=seed,
             fusion=fusion, joint_error=self.joint_error, settings=tuple(settings), faults=faults if self.link == "fmu" else (),
@@ -126,6 +141,15 @@ class Drawn:
     guilty: frozenset[int]
     begin: float
     late_percent: float = 0.0
+
+    @property
+    def what(self) -> str:
+        """The disturbance, and where it happens, in a line."""
+        c = self.config
+        settings = (each.text if len(each.value) <= 3 else each.name for each in c.settings)
+        texts = " ".join([*self.faults, *settings]) or "nothing"
+        texts += f" joint_error={c.joint_error:g}" if c.joint_error else ""
+        return f"{texts} on {c.mechanism}, {c.target}, {c.imu}, {c.rate:g} Hz"
 
 
 def guilty_of(faults: tuple[str, ...]) -> frozenset[int]:
@@ -201,6 +225,10 @@ def _points(entry: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
 
 
 def _value(name: str, value: Any, known: Mapping[str, Any]) -> Any:
+    if name == "sizes":
+        return _bounds(value)
+    if name == "draw":
+        return _choices(value, known)
     default = _KINDS[name]
     if name == "guilty" or default is MISSING:
         return tuple(value) if name == "guilty" else value
@@ -211,3 +239,23 @@ def _value(name: str, value: Any, known: Mapping[str, Any]) -> Any:
         return type(default)(filled)
     except ValueError:
         raise InputError(f"{name} = {value!r} must be a {type(default).__name__}") from None
+
+
+def _bounds(value: Any) -> tuple[float, float]:
+    if not isinstance(value, list) or len(value) != 2 or not all(isinstance(each, int | float) for each in value):
+        raise InputError(f"sizes = {value!r} must be two numbers, such as [0.1, 2]")
+    least, most = value
+    if not 0.0 < least <= most < np.inf:
+        raise InputError(f"sizes = {value!r} must be above 0, the smaller one first, such as [0.1, 2]")
+    return float(least), float(most)
+
+
+def _choices(value: Any, known: Mapping[str, Any]) -> dict[str, list[Any]]:
+    if not isinstance(value, dict):
+        raise InputError(f"draw = {value!r} must be a table of lists, such as {{ rate = [250, 1000] }}")
+    for name, choices in value.items():
+        if not isinstance(choices, list) or not choices:
+            raise InputError(f"draw.{name} = {choices!r} must be a list of values, such as [250, 1000]")
+        if name in _KINDS and name not in DRAWN:
+            raise InputError(f"draw.{name}: no seed draws that; of a row it may draw {', '.join(DRAWN)}")
+    return {name: [_value(name, each, known) if name in DRAWN else each for each in value[name]] for name in value}

@@ -188,7 +188,8 @@ def list_table(items: Iterable[Case | Row]) -> Table:
     for item in items:
         if isinstance(item, Row):
             what = (*item.faults, *item.settings, *_others(item))
-            table.add(item.kind, item.name, item.link, f"{item.rate:g}", f"{item.duration:g}", " ".join(what))
+            rate = "drawn" if "rate" in item.draw else f"{item.rate:g}"
+            table.add(item.kind, item.name, item.link, rate, f"{item.duration:g}", " ".join(what))
         else:
             table.add("reactions", item.name, "udp", f"{RATE_HZ:g}", "4.5", item.faults or item.streamed)
     return table
@@ -198,7 +199,8 @@ def _others(row: Row) -> tuple[str, ...]:
     """What else is not as the controller has it."""
     sizes = {"base_bend_mm": row.base_bend_mm, "joint_off_mm": row.joint_off_mm, "joint_error_mm": 1e3 * row.joint_error}
     sizes["late_percent"] = row.late_percent
-    return tuple(f"{name}={size:g}" for name, size in sizes.items() if size)
+    bounds = (f"size={row.sizes[0]:g}..{row.sizes[1]:g}",) if row.sizes else ()
+    return (*(f"{name}={size:g}" for name, size in sizes.items() if size), *bounds)
 
 
 def _joined(group: Sequence[dict[str, Any]], cell: Callable[[dict[str, Any]], str]) -> str:

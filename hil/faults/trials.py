@@ -66,7 +66,7 @@ def trials_of(items: Iterable[Case | Row], seeds: int, fusions: Sequence[str] = 
 
 
 def figures_of(trial: Trial) -> dict[str, Any]:
-    """The figures of a trial: those of `Outcome.row`, or of `verdict.judge`.
+    """The figures of a trial: those of `Outcome.row`, or those of `verdict.judge` and `what` was drawn.
 
     Raises:
         GoughError: it cannot be run.
@@ -75,7 +75,7 @@ def figures_of(trial: Trial) -> dict[str, Any]:
         return try_case(trial.what, trial.seed, trial.fusion).row()
     drawn = trial.what.drawn(trial.seed, trial.fusion)
     records, begin, cause = run(drawn)
-    return judge(records, begin, drawn.guilty, cause, drawn.config.rate)
+    return {"what": drawn.what, **judge(records, begin, drawn.guilty, cause, drawn.config.rate)}
 
 
 def run_trials(

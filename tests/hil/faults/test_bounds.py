@@ -147,6 +147,11 @@ def test_bad_input_gets_one_line(options, message, capsys):
     assert message in errors[-1] and not any("Traceback" in line for line in errors)
 
 
+def test_a_row_of_which_every_seed_draws_another_disturbance_has_no_bounds():
+    (found,) = bounds_of_rows([row for row in all_rows() if row.name == "drawn: IMUs turn"], 2)
+    assert not found.bounds and found.reason == "every seed draws another disturbance"
+
+
 @pytest.mark.endurance
 def test_only_shocks_and_joints_that_are_off_come_near_the_limits_before_they_are_told():
     """All other rows are told before the error exceeds two thirds of the limit."""

@@ -54,7 +54,8 @@ def test_a_seed_makes_a_run_of_every_row(name):
     row = ROWS[name]
     drawn, again, other = (row.drawn(seed, "whole") for seed in (3, 3, 4))
     assert drawn == again
-    assert drawn.config.seed == 3 and drawn.config.fusion == "whole" and drawn.config.rate == row.rate
+    assert drawn.config.seed == 3 and drawn.config.fusion == "whole"
+    assert drawn.config.rate in row.draw.get("rate", [row.rate])
     assert drawn.begin == 0.0 or row.earliest <= drawn.begin <= row.latest < row.duration
     assert drawn.begin != other.begin or drawn.begin == 0.0
     for text in drawn.faults:
@@ -128,9 +129,37 @@ def test_values_are_crossed_and_listed():
     assert len(rows_of({"kind": [entry | {"name": "{a} {b} {rate}", "faults": []}]})) == 8
 
 
+def test_every_seed_draws_a_size_and_a_choice_of_each_list():
+    row = Row(
+        "x", "y", ("imu-turn:{whom},axis={axis},size_deg={sign}{size}",), sizes=(0.5, 8.0),
+        draw={"whom": ["{k}", "{k}+{j}", "6"], "axis": ["x", "y"], "rate": [250, 500], "mechanism": ["6-5", "hexapod"]},
+    )  # fmt: skip
+    drawn = [row.drawn(seed, "whole") for seed in range(200)]
+    sizes = [abs(float(re.search("size_deg=([-0-9.]+)", each.faults[0]).group(1))) for each in drawn]
+    assert 0.5 <= min(sizes) < 0.55 and 7.0 < max(sizes) <= 8.0
+    # On a logarithmic scale, half of them are below the geometric mean.
+    assert 70 < sum(size < 2.0 for size in sizes) < 130
+    assert {(each.config.rate, each.config.mechanism) for each in drawn} == {
+        (r, m) for r in (250, 500) for m in ("6-5", "hexapod")
+    }
+    assert {len(each.guilty) for each in drawn} == {1, 2} and any(each.guilty == {6} for each in drawn)
+    assert drawn[7].what.startswith(drawn[7].faults[0]) and drawn[7].what.endswith(f" {drawn[7].config.rate:g} Hz")
+    # What is drawn besides changes neither the begin nor the legs.
+    fixed = Row("x", "y", ("imu-turn:{k},axis=x,size_deg=1",))
+    assert [each.begin for each in drawn] == [fixed.drawn(seed, "whole").begin for seed in range(200)]
+
+
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
+        ({"name": "a", "sizes": [0, 1]}, r"sizes = \[0, 1\] must be above 0, the smaller one first"),
+        ({"name": "a", "sizes": [2, 1]}, r"sizes = \[2, 1\] must be above 0, the smaller one first"),
+        ({"name": "a", "sizes": 3}, "sizes = 3 must be two numbers, such as"),
+        ({"name": "a", "sizes": ["x", 1]}, "must be two numbers, such as"),
+        ({"name": "a", "draw": ["x"]}, "must be a table of lists, such as"),
+        ({"name": "a", "draw": {"axis": []}}, r"draw.axis = \[\] must be a list of values"),
+        ({"name": "a", "draw": {"rate": ["fast"]}}, "rate = 'fast' must be a float"),
+        ({"name": "a", "draw": {"duration": [9]}}, "draw.duration: no seed draws that; of a row it may draw mechanism, target"),
         ({"name": "a", "fault": []}, "has no entry 'fault'|knows no|unknown"),
         ({"name": "a", "link": "usb"}, "'a' has link = 'usb'; there are fmu, udp, canopen"),
         ({"name": "a", "rate": "{x}"}, "rate = '{x}' must be a float"),
