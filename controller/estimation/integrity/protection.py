@@ -101,7 +101,7 @@ _OF_CREPT = 1.3
 _USUALLY_DRIFTED, _OF_DRIFTED = (0.3, 0.7), (3.0, 2.5)
 """The drift from what gravity shows counts beyond so many standard deviations of the closed form, so many times."""
 
-_WELL_SHOWN, _OF_TURN = 5e-4, 3.0
+_WELL_SHOWN, _OF_TURN = 5e-4, 5.0
 """The standard deviation of the rotation by the legs counts beyond the first [rad], so many times. On 6-4-II at 250 Hz
 it is some 3 mrad, and a slow turn of the platform's IMU turns the pose by up to 0.9 deg before it is told.
 """

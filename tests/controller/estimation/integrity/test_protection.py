@@ -178,7 +178,7 @@ def test_a_rotation_that_the_legs_hardly_show_raises_the_level_of_the_rotation_a
     level["determined"] = 1
     sound = ended(level, age)
     np.testing.assert_array_equal(ended(level, age, by_legs=5e-4), sound)
-    np.testing.assert_allclose(ended(level, age, by_legs=2.5e-3), np.hypot(sound, [0.0, 0.006 * share]))
+    np.testing.assert_allclose(ended(level, age, by_legs=2.5e-3), np.hypot(sound, [0.0, 0.01 * share]))
 
 
 def test_measurements_that_contradict_each_other_raise_the_level_between_evaluations():
