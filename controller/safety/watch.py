@@ -55,9 +55,9 @@ sum ends the run. Evidence of less than the last share of the most evidence (bot
 """
 
 _SUSPECTED, _SUSPICION_EVALUATIONS = 0.375, 20
-"""The platform's IMU is suspected from this share of the limit on, for so many evaluations from the last such one on. In that
-time evidence leaves out no other IMU: the pose follows the platform's IMU, so if this turns slowly, the pose is off, and a
-leg's IMU may contradict the others more at last.
+"""The platform's IMU is suspected while the sum is at least this share of the limit, and for so many evaluations from the last
+such one on. In that time evidence leaves out no other IMU. The pose follows the platform's IMU. If that turns slowly, the pose
+is off, and at last a leg's IMU may seem to contradict the others more.
 """
 
 _FIRST_COUNTED = 20
@@ -411,8 +411,8 @@ def judge_evidence(
     p: Record, s: Record, rig: Record, time: Record, imus: Record, integrity: Record, reference: Record, pid: Record
 ) -> bool:
     """After an evaluation of the evidence for faults of the present set of IMUs: take back IMUs that agree again. Else leave
-    out the IMU that the evidence blames, if it clearly blames this one alone and the rest agrees, and none that is needed has
-    been suspected before; wait for more if that is not clear; else stop. Returns whether the set of IMUs has changed.
+    out the IMU that the evidence blames, if it clearly blames this one alone, the rest agrees, and the platform's IMU is not
+    suspected; wait for more if that is not clear; else stop. Returns whether the set of IMUs has changed.
 
     Below the limit, stop if all IMUs share the error or one has it that cannot be left out, if evidence against that one adds
     up, or if three evaluations in a row leave too much unexplained.
@@ -512,7 +512,7 @@ def _may_leave_out(p: Record, imus: Record, k: int) -> bool:
 
 @kernel
 def _report_rival(s: Record, e: Record, named: int) -> None:
-    """Say what else may be wrong than the IMU that has been named (-1: all share the error): what has more evidence, the
+    """Say what else may be wrong, besides the IMU that has been named (-1: all share the error): what has more evidence, the
     platform's IMU if it is suspected and a leg's has been named, or what explains the readings nearly as well.
     """
     if named != e.blamed:

@@ -58,7 +58,7 @@ class Row:
         late_percent: share of the cycles that begin one to `MOST_LATE` periods late, as on a busy machine [%].
         guilty: the IMUs that may rightly be left out; None for those that have a disturbance alone, or with a few others.
         sizes: bounds of {size}, which every seed draws on a logarithmic scale; none if there is nothing to draw.
-        draw: choices by name, of which every seed draws one each. They stand for {name}; those of `DRAWN` replace the above.
+        draw: lists by name; every seed draws a value of each. It stands for {name} in texts; one of `DRAWN` replaces the above.
     """
 
     name: str
@@ -257,5 +257,5 @@ def _choices(value: Any, known: Mapping[str, Any]) -> dict[str, list[Any]]:
         if not isinstance(choices, list) or not choices:
             raise InputError(f"draw.{name} = {choices!r} must be a list of values, such as [250, 1000]")
         if name in _KINDS and name not in DRAWN:
-            raise InputError(f"draw.{name}: no seed draws that; of a row it may draw {', '.join(DRAWN)}")
+            raise InputError(f"draw.{name}: a seed cannot draw this entry; it can draw {', '.join(DRAWN)}")
     return {name: [_value(name, each, known) if name in DRAWN else each for each in value[name]] for name in value}

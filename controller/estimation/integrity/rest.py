@@ -42,9 +42,10 @@ _WARMING_S, _ADDED_S = 20.0, 5.0
 """Time constants of the gyroscopes' mean later on, and of the sums of a motion at rest [s]."""
 
 _TOLD, _OF_SPREAD, _LONG_S = 2e-3, 4.0, 2e-3
-"""A motion at rest is told beyond the first [m RMS of the legs], and beyond so many standard deviations of the lengths, as the
-pose in closed form has them: while the estimate settles, the loop moves the platform by what it errs. In periods longer than
-the last [s], noise aliases more than that says, by the root of their ratio.
+"""A motion at rest is told beyond the first [m RMS of the legs] and beyond so many standard deviations of the lengths, by the
+covariance of the pose in closed form: while the estimate settles, its error changes, and the loop moves the platform with it.
+With periods longer than the last [s], more noise aliases than this covariance says. So the standard deviation is multiplied by
+the root of the ratio of the periods.
 """
 
 _COMMANDS, _GYROSCOPES, _WAYS = 0, 1, 2

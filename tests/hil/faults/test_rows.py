@@ -159,7 +159,10 @@ def test_every_seed_draws_a_size_and_a_choice_of_each_list():
         ({"name": "a", "draw": ["x"]}, "must be a table of lists, such as"),
         ({"name": "a", "draw": {"axis": []}}, r"draw.axis = \[\] must be a list of values"),
         ({"name": "a", "draw": {"rate": ["fast"]}}, "rate = 'fast' must be a float"),
-        ({"name": "a", "draw": {"duration": [9]}}, "draw.duration: no seed draws that; of a row it may draw mechanism, target"),
+        (
+            {"name": "a", "draw": {"duration": [9]}},
+            "draw.duration: a seed cannot draw this entry; it can draw mechanism, target",
+        ),
         ({"name": "a", "fault": []}, "has no entry 'fault'|knows no|unknown"),
         ({"name": "a", "link": "usb"}, "'a' has link = 'usb'; there are fmu, udp, canopen"),
         ({"name": "a", "rate": "{x}"}, "rate = '{x}' must be a float"),
