@@ -136,6 +136,7 @@ RUNNING_LIMITS: Limits = {
     "safety.stop.earlier_cause": (Cause.NONE, Cause.NONE),
     "safety.arming.obstacle": (Cause.NONE, max(Cause)),
     "safety.events.count": (0, 0),
+    "pid.halvings": (0, MOST),
     **{f"integrity.{name}": limits for name, limits in integrity.LIMITS.items()},
 }
 """The same of the state between two cycles of a run that is not stopping."""
@@ -490,7 +491,7 @@ def _watch(parameters: Record, state: Record) -> int:
         )  # fmt: skip
         rest.compare_at_rest(
             s.integrity.rest, rig, elapsed(rig, time), follows_commands(s.safety), s.encoders.counts.any(),
-            s.integrity.commanded.rate, p.load.droop, s.load.drive, s.integrity.parity.twist,
+            s.imus.shaking.told != 0, s.integrity.commanded.rate, p.load.droop, s.load.drive, s.integrity.parity.twist,
             s.integrity.protection.covariance[0], 2 * s.safety.watch.used_imus + s.mechanism.trusted, pose, s.reference,
         )  # fmt: skip
         watch.check_rest(p.safety, s.safety, rig, time, s.integrity.rest, s.reference, s.pid)

@@ -2,6 +2,9 @@
 
 `u = v_ref + u_ff + Kp e + Ki integral(e) + Kd e'`, e = l_ref - l_is. The derivative is low-passed. Against wind-up, the
 integral rests while the command is at its limit and the error would drive it further.
+
+Gains that make the mechanism oscillate can be halved in motion: then Kp and Kd are half, and Ki is a quarter of what it was. So
+the loop has half its bandwidth and the same damping.
 """
 
 import numpy as np
@@ -23,6 +26,7 @@ STATE = record_dtype(
     previous_error=(np.float64, LEGS),
     derivative=(np.float64, LEGS),  # of the error, low-passed [m/s]
     command=(np.float64, LEGS),  # [m/s]
+    halvings=np.int64,  # how often the gains have been halved
 )
 """The state of each controller."""
 
@@ -37,15 +41,23 @@ def pid_parameters(control: ControlSettings, velocity: float) -> Record:
 def step_pid(p: Record, s: Record, feed_forward: Array, period: float) -> None:
     """Write the commands from the errors and the feed-forward (6,) [m/s], over one period [s]."""
     gains = p.gains
+    share = 0.5**s.halvings
     smoothing = period * gains[3] / (1.0 + period * gains[3])
     for k in range(LEGS):
         e = s.error[k]
         s.derivative[k] += smoothing * ((e - s.previous_error[k]) / period - s.derivative[k])
         s.previous_error[k] = e
-        wanted = feed_forward[k] + gains[0] * e + gains[1] * s.integral[k] + gains[2] * s.derivative[k]
+        wanted = feed_forward[k] + share * (gains[0] * e + share * gains[1] * s.integral[k] + gains[2] * s.derivative[k])
         s.command[k] = min(max(wanted, -p.limit), p.limit)
         if s.command[k] == wanted or (wanted - s.command[k]) * e < 0.0:
             s.integral[k] += period * e
+
+
+@kernel
+def halve_gains(s: Record) -> None:
+    """Halve the gains from the next command on; what the integral adds to it stays the same."""
+    s.halvings += 1
+    s.integral[:] *= 4.0
 
 
 @kernel

@@ -187,6 +187,12 @@ class Cause(IntEnum):
         Reaction.STOP,
         "m/s RMS",
     )
+    GAINS_HALVED = (
+        85,
+        "the gains are halved, as the commands oscillate, most of all that of leg {}: it has play, or the gains are too high",
+        Reaction.GO_ON,
+        "m/s RMS",
+    )
 
     ENCODER_SILENT = 67, "the encoder of leg {} reads nothing", Reaction.GO_ON
     ENCODER_CONTRADICTED = 68, "the encoder of leg {} is left out: IMUs and other encoders contradict it", Reaction.GO_ON, "m"

@@ -4,6 +4,7 @@ import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
 from controller.estimation.integrity.parity import OF_TWO, SHARED
+from controller.pid import halve_gains
 from controller.rig import elapsed
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
@@ -60,9 +61,10 @@ such one on. In that time evidence leaves out no other IMU. The pose follows the
 is off, and at last a leg's IMU may seem to contradict the others more.
 """
 
-_FIRST_COUNTED = 20
-"""From which evaluation on these rules count: until then nothing has been learned, and what a calibration does not know, such
-as clocks of the IMUs' own, is left unexplained, above all at low rates.
+_FIRST_COUNTED, _FIRST_ADDED = 20, 30
+"""From which evaluation on these rules count, and from which on the sum is taken: until then nothing has been learned, and what
+a calibration does not know, such as clocks of the IMUs' own, is left unexplained, above all at low rates. Where legs have play,
+what their motors do as the brakes open looks like an error of the platform's IMU for some two seconds.
 """
 
 _NEARLY = 0.7
@@ -82,6 +84,9 @@ _FAST_S = 0.1
 
 _OSCILLATING_S = 1.0
 """For how long a mean square must be beyond its limit: a step of the estimate is corrected in less [s]."""
+
+_HALVINGS = 2
+"""So many times the gains are halved, beyond a quarter and a half of the limit (RMS) for a quarter and a half of this time."""
 
 _BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0
 """How long there may be no reading of the base's IMU, and how long the first one may take [s]."""
@@ -293,8 +298,10 @@ def check_carried(
 def check_oscillation(
     p: Record, s: Record, rig: Record, time: Record, shaking: Record, feed_forward: Array, reference: Record, pid: Record
 ) -> None:
-    """After the commands: stop when what the controllers add to the feed-forward (6,) [m/s] goes to and fro for long, fast and
-    far, and shakes the IMUs, as it does where the legs have play. If it does not shake them, it is noise of the estimate.
+    """After the commands: halve the gains when what the PIDs add to the feed-forward (6,) [m/s] goes to and fro for long,
+    fast and far, and shakes the IMUs, as it does where the legs have play. Stop when that does not help.
+
+    If it does not shake them, it is noise of the estimate.
     """
     w = s.watch
     share = min(1.0, elapsed(rig, time) / _FAST_S)
@@ -306,10 +313,17 @@ def check_oscillation(
         total += w.oscillation[k]
         if w.oscillation[k] > w.oscillation[worst]:
             worst = k
-    square, limit = total / rig.legs, p.watch.oscillation
-    w.oscillating_for = w.oscillating_for + elapsed(rig, time) if square > limit and shaking.told != 0 else 0.0
-    if w.oscillating_for > _OSCILLATING_S and s.mode == Mode.RUNNING:
-        handle_cause(p, s, rig, time, reference, pid, Cause.OSCILLATES, worst, np.sqrt(square), np.sqrt(limit))
+    rms, left = np.sqrt(total / rig.legs), _HALVINGS - pid.halvings
+    limit = np.sqrt(p.watch.oscillation) / 2**left
+    shakes = rms > limit and shaking.told != 0 and s.mode == Mode.RUNNING
+    w.oscillating_for = w.oscillating_for + elapsed(rig, time) if shakes else 0.0
+    if w.oscillating_for > _OSCILLATING_S / 2**left:
+        w.oscillating_for = 0.0
+        if left > 0:
+            halve_gains(pid)
+            report_event(s.events, Cause.GAINS_HALVED, worst, rms, limit)
+        else:
+            handle_cause(p, s, rig, time, reference, pid, Cause.OSCILLATES, worst, rms, limit)
 
 
 @kernel
@@ -470,14 +484,14 @@ def _count_evaluations(p: Record, w: Record, e: Record, rest: float, usual_rest:
     """Count the evaluations in a row that leave too much unexplained; and add up the evidence against the platform's IMU, if it
     is needed.
     """
-    counts, sigma = e.evaluations >= _FIRST_COUNTED, np.sqrt(p.evidence)
+    counts, adds, sigma = e.evaluations >= _FIRST_COUNTED, e.evaluations >= _FIRST_ADDED, np.sqrt(p.evidence)
     most_rest, most = _UNEXPLAINED * p.evidence + usual_rest, _CONTRADICTED * sigma
     w.unexplained_for = w.unexplained_for + 1 if counts and rest >= most_rest else 0
     found = e.platform_evidence if e.platform_evidence >= _OF_BEST * e.best_evidence else 0.0
     beyond = np.sqrt(max(found, 0.0)) - _USUAL * sigma
     # What adds up on the brakes may delay arming by a limited time only.
     added = min(max(w.against_platform + beyond, 0.0), 2.0 * most)
-    w.against_platform = added if counts and _is_needed(p, PLATFORM_IMU) else 0.0
+    w.against_platform = added if adds and _is_needed(p, PLATFORM_IMU) else 0.0
     suspected = w.against_platform >= _SUSPECTED * sigma
     w.suspicion = _SUSPICION_EVALUATIONS if suspected else max(w.suspicion - 1, 0)
     w.lasting[:] = 0.0

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
-from controller.pid import PARAMETERS, STATE, hold_still, pid_parameters, step_pid
+from controller.pid import PARAMETERS, STATE, halve_gains, hold_still, pid_parameters, step_pid
 from controller.settings import ControlSettings
 
 PERIOD_S = 1e-3
@@ -213,6 +213,26 @@ def test_the_gains_and_the_limit_are_those_of_the_settings():
     parameters = pid_parameters(control, 0.08)
     assert parameters["gains"].tolist() == [11.0, 22.0, 0.3, 44.0]
     assert parameters["limit"] == pytest.approx(0.12, rel=1e-15)
+
+
+@pytest.mark.parametrize("halvings", [1, 2])
+def test_halved_gains_have_the_transfer_function_of_half_the_bandwidth_and_begin_without_a_jump(halvings):
+    share = 0.5**halvings
+    random = np.random.default_rng(8)
+    errors = np.cumsum(random.normal(scale=1e-4, size=(400, 6)), axis=0)
+    gains = np.array([60.0, 200.0, 0.5, 100.0])
+    halved, lower = Controllers(gains, 1e9), Controllers(gains * [share, share**2, share, 1.0], 1e9)
+    halved.state["halvings"] = halvings
+    for error in errors:
+        np.testing.assert_allclose(halved.step(error), lower.step(error), rtol=1e-12)
+
+    held = Controllers([0.0, 200.0, 0.0, 100.0])
+    for error in errors:
+        held.step(error)
+    before = held.step(0.0)
+    for _ in range(halvings):
+        halve_gains(held.state)
+    np.testing.assert_allclose(held.step(0.0), before, rtol=1e-12)
 
 
 @pytest.mark.parametrize("legs", [3, 6])

@@ -17,7 +17,8 @@ The protection level grows with it. When the platform moves again, both fade.
 
 The mean of g goes on to be learned slowly, as gyroscopes get warm. A load that changes is in m_c alone, gyroscopes that drift
 are in m_g alone. What is in both is a motion of the platform that its estimate does not show. When the pose comes from other
-IMUs or another filter, or many periods were missed, the loop corrects it, and both means are taken anew.
+IMUs or another filter, or many periods were missed, the loop corrects it, and both means are taken anew. So they are after IMUs
+were shaken, as then the commands were mostly noise.
 """
 
 import numpy as np
@@ -72,8 +73,8 @@ STATE = record_dtype(
 
 @kernel
 def compare_at_rest(
-    s: Record, rig: Record, duration: float, follows: bool, measured: bool, commanded: Array, droop: float, drive: Array,
-    twist: Array, covariance: Array, source: int, pose: Record, reference: Record,
+    s: Record, rig: Record, duration: float, follows: bool, measured: bool, shaken: bool, commanded: Array, droop: float,
+    drive: Array, twist: Array, covariance: Array, source: int, pose: Record, reference: Record,
 ) -> None:  # fmt: skip
     """After the commands of a cycle: add up what they and the gyroscopes say of a motion at rest.
 
@@ -82,6 +83,7 @@ def compare_at_rest(
         duration: since the last cycle [s].
         follows: whether the drives follow the commands.
         measured: whether encoders measure the lengths, so that nothing moves unseen at rest.
+        shaken: whether IMUs are shaken.
         commanded: (6,), rate of each leg as it was commanded, after the lag [m/s].
         droop, drive: droop [m/s/N] and load of each leg (6,) [N]: their product is the load's share.
         twist: (6,), of the platform beyond the planned one, that fits all gyroscopes [m/s, rad/s].
@@ -91,7 +93,7 @@ def compare_at_rest(
     still = follows and not measured
     for k in range(rig.legs):
         still = still and abs(reference.motion[k, 1]) < _REST_MPS
-    if source != s.source or not still:
+    if source != s.source or not still or shaken:
         s.source = source
         forget_motion(s)
     if not still:

@@ -526,8 +526,14 @@ def test_while_the_whole_mechanism_filter_is_trusted_its_rotation_counts():
 # ------------------------------------------------------------------------------------------------------ commands that oscillate
 
 
-def corrections_bear(seconds, amplitude, frequency, told=1, mode=Mode.RUNNING, steady=0.0):
-    """Whether a run bears for so long that the commands of all legs go to and fro by so much [m/s] about their feed-forward."""
+def corrections_bear(seconds, amplitude, frequency, **run):
+    """How a run ends whose commands go to and fro by so much [m/s] about their feed-forward; None if it does not."""
+    state, after = oscillated(seconds, amplitude, frequency, **run)
+    return None if state["safety"]["stop"]["cause"] == Cause.NONE else (stop_of(state), after)
+
+
+def oscillated(seconds, amplitude, frequency, told=1, mode=Mode.RUNNING, steady=0.0):
+    """The state after so long of such commands of all legs, or when they have ended the run, and how long that was [s]."""
     _, parameters, state = moving()
     s, period = state["safety"], float(parameters["rig"]["period"])
     state["imus"]["shaking"]["told"], s["mode"] = told, mode
@@ -541,17 +547,31 @@ def corrections_bear(seconds, amplitude, frequency, told=1, mode=Mode.RUNNING, s
             feed_forward, state["reference"][()], state["pid"][()],
         )  # fmt: skip
         if s["stop"]["cause"] != Cause.NONE:
-            return stop_of(state), period * cycle
-    return None
+            break
+    return state, period * cycle
 
 
 @pytest.mark.parametrize("frequency", [10.0, 18.0, 60.0])
-def test_commands_that_oscillate_while_the_imus_are_shaken_end_a_run_after_a_second(frequency):
+def test_commands_that_oscillate_with_halved_gains_as_well_end_a_run_after_a_second(frequency):
     limit = SafetySettings().oscillation
     assert corrections_bear(3.0, 0.95 * np.sqrt(2.0) * limit, frequency) is None
     (cause, leg, value, most), after = corrections_bear(3.0, 1.2 * np.sqrt(2.0) * limit, frequency)
     assert cause == Cause.OSCILLATES and 0 <= leg < 6 and limit < value < 1.25 * limit and most == pytest.approx(limit)
-    assert 1.0 < after < 1.4
+    assert 1.75 < after < 1.95, "0.25 s, 0.5 s and 1 s"
+
+
+def test_commands_that_oscillate_while_the_imus_are_shaken_have_the_gains_halved_twice():
+    limit = SafetySettings().oscillation
+    for share, seconds, halvings in (
+        (0.24, 3.0, 0), (0.3, 0.24, 0), (0.3, 0.5, 1), (0.48, 3.0, 1), (0.6, 0.24, 0), (0.6, 0.7, 1), (0.6, 1.0, 2),
+        (0.95, 3.0, 2),
+    ):  # fmt: skip
+        state, _ = oscillated(seconds, share * np.sqrt(2.0) * limit, 18.0)
+        assert state["pid"]["halvings"] == halvings, (share, seconds)
+        told = state["safety"]["events"]
+        assert told["cause"][:halvings].tolist() == [Cause.GAINS_HALVED] * halvings and told["count"] == halvings
+        np.testing.assert_allclose(told["limit"][:halvings], limit * np.array([0.25, 0.5])[:halvings])
+        assert state["safety"]["mode"] == Mode.RUNNING
 
 
 @pytest.mark.parametrize(
@@ -693,10 +713,10 @@ def test_evidence_that_adds_up_against_the_platforms_imu_ends_a_motion(imu, need
     if not needed:
         parameters["safety"]["watch"]["without_platform_imu"] = np.inf
     weigh(state, imu, evidence, 7.0, platform=platform)
-    # The first two seconds do not count.
-    state["integrity"]["evaluations"] = 19
+    # The first three seconds do not count.
+    state["integrity"]["evaluations"] = 29
     assert evaluations_until_a_stop(parameters, state) is None
-    state["integrity"]["evaluations"] = 20
+    state["integrity"]["evaluations"] = 30
     assert evaluations_until_a_stop(parameters, state) == expected
     if expected:
         added = expected * ((platform or evidence) - 3.0)
@@ -709,7 +729,7 @@ def test_evidence_that_adds_up_against_the_platforms_imu_ends_a_motion(imu, need
 def test_less_evidence_against_the_platforms_imu_takes_off_from_the_sum(between, expected):
     """Evaluations with 4.6 and less sigma take turns; what was learned does not count."""
     _, parameters, state = moving()
-    state["integrity"]["evaluations"] = 20
+    state["integrity"]["evaluations"] = 30
     ended = None
     for n in range(40):
         high = n % 2 == 0
@@ -726,7 +746,7 @@ def test_less_evidence_against_the_platforms_imu_takes_off_from_the_sum(between,
 def test_a_sum_that_ends_a_motion_does_so_beside_more_evidence_that_names_no_imu_clearly():
     """Without the sum, more evidence would be awaited: something else explains the readings as well."""
     _, parameters, state = moving()
-    state["integrity"]["evaluations"] = 20
+    state["integrity"]["evaluations"] = 30
     weigh(state, 2, 8.5, 9.0, rival=8.4, platform=6.2)
     assert evaluations_until_a_stop(parameters, state) == 2
     assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(6.4), pytest.approx(6.0))
@@ -738,7 +758,7 @@ def test_a_sum_that_grew_on_the_brakes_delays_arming_by_a_limited_time():
     """It is kept below twice its limit, and 2 sigma take off 1 each time."""
     _, parameters, state = moving(mode=Mode.IDLE)
     watch = state["safety"]["watch"]
-    state["integrity"]["evaluations"] = 20
+    state["integrity"]["evaluations"] = 30
     weigh(state, 3, 9.0, 9.0, platform=8.0)
     for _ in range(100):
         assert not judge(parameters, state)
@@ -782,7 +802,7 @@ def test_less_evidence_ends_a_motion_where_no_imu_could_be_left_out(imu, evidenc
 def test_evidence_about_another_set_of_imus_does_not_last(change):
     _, parameters, state = moving()
     p, s, integrity = parameters, state, state["integrity"]
-    state["imus"]["healthy"], integrity["evaluations"] = 1, 20
+    state["imus"]["healthy"], integrity["evaluations"] = 1, 30
     weigh(state, 6, 4.9, 7.0)
     assert evaluations_until_a_stop(parameters, state, 4) is None
     if change == "back":
@@ -809,7 +829,7 @@ def test_evidence_about_another_set_of_imus_does_not_last(change):
 def test_no_imu_is_left_out_while_the_platforms_imu_is_suspected(suspected, evidence, needed, calm, left_out):
     """A sum of 3 sigma beyond 3 makes it suspected, and for 19 evaluations more, if the run needs it."""
     _, parameters, state = moving()
-    state["imus"]["healthy"], state["integrity"]["evaluations"] = 1, 20
+    state["imus"]["healthy"], state["integrity"]["evaluations"] = 1, 30
     if not needed:
         parameters["safety"]["watch"]["without_platform_imu"] = np.inf
     for imu, found, evaluations in ((6, evidence, suspected), (2, 3.0, calm)):
@@ -829,7 +849,7 @@ def test_no_imu_is_left_out_while_the_platforms_imu_is_suspected(suspected, evid
 def test_the_platforms_imu_is_suspected_if_a_legs_is_not_twice_as_likely(of_leg, left_out):
     """At 4.5 sigma; the evidence is the square."""
     _, parameters, state = moving()
-    state["imus"]["healthy"], state["integrity"]["evaluations"] = 1, 20
+    state["imus"]["healthy"], state["integrity"]["evaluations"] = 1, 30
     weigh(state, 2, of_leg, 7.5, platform=4.5)
     assert evaluations_until_a_stop(parameters, state, 4) is None
     weigh(state, 2, 9.0, 9.5)
@@ -839,7 +859,7 @@ def test_the_platforms_imu_is_suspected_if_a_legs_is_not_twice_as_likely(of_leg,
 def test_the_platforms_imu_stays_suspected_when_another_one_is_taken_back():
     _, parameters, state = moving()
     integrity, evidence = state["integrity"], state["integrity"]["evidence"]
-    state["imus"]["healthy"], integrity["evaluations"], state["imus"]["excluded"][3] = 1, 20, 1
+    state["imus"]["healthy"], integrity["evaluations"], state["imus"]["excluded"][3] = 1, 30, 1
     weigh(state, 6, 4.1, 5.0)
     assert evaluations_until_a_stop(parameters, state, 4) is None
     state["safety"]["watch"]["cleared_for"][3] = 5

@@ -28,14 +28,14 @@ class Resting:
         self.mechanism, self.parameters, self.state = moving(mechanism)
         self.loads, self.covariance = np.zeros(6), np.zeros((6, 6))
 
-    def run(self, seconds, commands=0.0, twist=0.0, follows=True, measured=False, source=0):
+    def run(self, seconds, commands=0.0, twist=0.0, follows=True, measured=False, shaken=False, source=0):
         """Cycles with these commands of all legs [m/s] and this twist that the gyroscopes show."""
         s = self.state
         commanded, twist = np.broadcast_to(commands, 6).astype(float), np.broadcast_to(twist, 6).astype(float)
         for _ in range(round(seconds / PERIOD_S)):
             compare_at_rest(
-                self.rest[()], self.parameters["rig"][()], PERIOD_S, follows, measured, commanded, DROOP, self.loads, twist,
-                self.covariance, source, s["pose"][()], s["reference"][()],
+                self.rest[()], self.parameters["rig"][()], PERIOD_S, follows, measured, shaken, commanded, DROOP, self.loads,
+                twist, self.covariance, source, s["pose"][()], s["reference"][()],
             )  # fmt: skip
 
     @property
@@ -114,6 +114,19 @@ def test_nothing_is_added_up_where_encoders_measure_the_legs():
     loop.run(2.6, measured=True)
     loop.run(2.4, 0.002, 0.002, measured=True)
     assert (loop.crept == 0.0).all() and loop.rest["both"] == 0.0
+
+
+def test_while_imus_are_shaken_no_motion_is_added_up_and_the_means_are_taken_anew_after_it():
+    loop = Resting()
+    twist = np.array([2e-3, -1e-3, 1e-3, 5e-3, 0.0, 2e-3])
+    rates = loop.rates_of(twist)
+    loop.run(2.6)
+    loop.run(1.0, rates, twist)
+    assert loop.rest["both"] > 1e-3
+    loop.run(1.0, 30.0 * rates, 30.0 * twist, shaken=True)
+    assert loop.rest["both"] == 0.0
+    loop.run(MEAN_S + 1.0, rates, twist)
+    assert loop.rest["both"] < 1e-7
 
 
 def expected_sum(rate, seconds, warming):
