@@ -497,7 +497,7 @@ def _watch(parameters: Record, state: Record) -> int:
         watch.check_rest(p.safety, s.safety, rig, time, s.integrity.rest, s.reference, s.pid)
     if follows_commands(s.safety):
         watch.check_oscillation(
-            p.safety, s.safety, rig, time, s.imus.shaking, s.load.feed_forward, s.reference, s.pid
+            p.safety, s.safety, rig, time, s.imus.shaking, s.integrity.parity.twist, s.load.feed_forward, s.reference, s.pid
         )  # fmt: skip
     watch.check_carried(p.safety, s.safety, rig, time, s.imus.shaking, s.legs, s.mechanism, s.reference, s.pid)
     time.cycle += 1

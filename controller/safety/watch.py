@@ -1,5 +1,7 @@
 """What is checked in every cycle: the rig's answers, the agreement of the IMUs, and every limit of the motion."""
 
+from math import radians
+
 import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
@@ -86,7 +88,14 @@ _OSCILLATING_S = 1.0
 """For how long a mean square must be beyond its limit: a step of the estimate is corrected in less [s]."""
 
 _HALVINGS = 2
-"""So many times the gains are halved, beyond a quarter and a half of the limit (RMS) for a quarter and a half of this time."""
+"""So many times the gains are halved, beyond a quarter and a half of the limit (RMS) for a quarter and a half of this time. So
+many times it is beyond, so much sooner they are.
+"""
+
+_TURNING = radians(1.5)
+"""If the platform turns to and fro faster than this [rad/s RMS], beyond what is planned, it oscillates indeed. Else only IMUs
+are shaken, and lower gains do not help.
+"""
 
 _BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0
 """How long there may be no reading of the base's IMU, and how long the first one may take [s]."""
@@ -136,6 +145,8 @@ STATE = record_dtype(
     correction=(np.float64, LEGS),  # of each command beyond its feed-forward, averaged [m/s]
     oscillation=(np.float64, LEGS),  # square of what the correction is apart from that, averaged [m^2/s^2]
     oscillating_for=np.float64,  # how long the mean of these squares has been beyond its limit [s]
+    turn=(np.float64, 3),  # mean angular velocity beyond the planned one [rad/s]
+    turning=np.float64,  # mean square of what it has beyond that [rad^2/s^2]
     speed=(np.float64, LEGS),  # estimated, of each leg [m/s]
     variance=(np.float64, 2),  # of the least known direction, of the leg filters and of the whole-mechanism filter [rad^2]
     calm_variance=(np.float64, 2),  # the same when nothing shook the IMUs last
@@ -296,12 +307,15 @@ def check_carried(
 
 @kernel
 def check_oscillation(
-    p: Record, s: Record, rig: Record, time: Record, shaking: Record, feed_forward: Array, reference: Record, pid: Record
-) -> None:
-    """After the commands: halve the gains when what the PIDs add to the feed-forward (6,) [m/s] goes to and fro for long,
-    fast and far, and shakes the IMUs, as it does where the legs have play. Stop when that does not help.
+    p: Record, s: Record, rig: Record, time: Record, shaking: Record, twist: Array, feed_forward: Array, reference: Record,
+    pid: Record,
+) -> None:  # fmt: skip
+    """After the commands: halve the gains when what the PIDs add to the feed-forward (6,) [m/s] goes to and fro for long, fast
+    and far, and turns the platform, as it does where the legs have play. Stop when that does not help, or when it shakes the
+    IMUs without turning the platform. If it does neither, it is noise of the estimate.
 
-    If it does not shake them, it is noise of the estimate.
+    Args:
+        twist: (6,), of the platform beyond the planned one, by all gyroscopes [m/s, rad/s].
     """
     w = s.watch
     share = min(1.0, elapsed(rig, time) / _FAST_S)
@@ -313,10 +327,18 @@ def check_oscillation(
         total += w.oscillation[k]
         if w.oscillation[k] > w.oscillation[worst]:
             worst = k
-    rms, left = np.sqrt(total / rig.legs), _HALVINGS - pid.halvings
-    limit = np.sqrt(p.watch.oscillation) / 2**left
-    shakes = rms > limit and shaking.told != 0 and s.mode == Mode.RUNNING
-    w.oscillating_for = w.oscillating_for + elapsed(rig, time) if shakes else 0.0
+    squared = 0.0
+    for i in range(3):
+        beyond = twist[3 + i] - w.turn[i]
+        w.turn[i] += share * beyond
+        squared += beyond * beyond
+    w.turning += share * (squared - w.turning)
+    turns = w.turning > _TURNING**2
+    left = _HALVINGS - pid.halvings if turns else 0
+    rms, limit = np.sqrt(total / rig.legs), np.sqrt(p.watch.oscillation) / 2**left
+    oscillates = rms > limit and (turns or shaking.told != 0) and s.mode == Mode.RUNNING
+    sooner = rms / limit if left > 0 else 1.0
+    w.oscillating_for = w.oscillating_for + elapsed(rig, time) * sooner if oscillates else 0.0
     if w.oscillating_for > _OSCILLATING_S / 2**left:
         w.oscillating_for = 0.0
         if left > 0:

@@ -42,9 +42,12 @@ class Shaken:
     ],
 )
 def test_shocks_and_clipped_readings_do_not_end_a_run_nor_bend_its_pose(fusion, faults, told, most):
-    """The gyroscopes carry it half a second after the start, when their biases are hardly known."""
+    """The gyroscopes carry it half a second after the start, when their biases are hardly known.
+
+    The estimate still trembles, and so the platform may: then the gains are halved.
+    """
     run = Shaken(*faults, fusion=fusion)
-    assert run.stopped is None and run.told == told
+    assert run.stopped is None and [cause for cause in run.told if cause != Cause.GAINS_HALVED] == told
     assert run.used == 0x7F
     assert run.position < most and run.rotation < 0.6
 
