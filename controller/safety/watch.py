@@ -92,7 +92,7 @@ _HALVINGS = 2
 many times it is beyond, so much sooner they are.
 """
 
-_TURNING = radians(1.5)
+_TURNING = radians(2.2)
 """If the platform turns to and fro faster than this [rad/s RMS], beyond what is planned, it oscillates indeed. Else only IMUs
 are shaken, and lower gains do not help.
 """

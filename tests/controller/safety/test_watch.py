@@ -568,15 +568,15 @@ def test_a_platform_that_oscillates_has_its_gains_halved_twice_and_is_stopped_if
         (0.24, 3.0, 0), (0.3, 0.15, 0), (0.3, 0.5, 1), (0.48, 3.0, 1), (0.6, 0.08, 0), (0.6, 0.4, 1), (0.6, 0.9, 2),
         (0.95, 3.0, 2),
     ):  # fmt: skip
-        state, _ = oscillated(seconds, share * np.sqrt(2.0) * limit, 18.0, told, turning=np.radians(2.0))
+        state, _ = oscillated(seconds, share * np.sqrt(2.0) * limit, 18.0, told, turning=np.radians(3.0))
         assert state["pid"]["halvings"] == halvings, (share, seconds)
         events = state["safety"]["events"]
         assert events["cause"][:halvings].tolist() == [Cause.GAINS_HALVED] * halvings and events["count"] == halvings
         np.testing.assert_allclose(events["limit"][:halvings], limit * np.array([0.25, 0.5])[:halvings])
         assert state["safety"]["mode"] == Mode.RUNNING
-    state, after = oscillated(3.0, 1.2 * np.sqrt(2.0) * limit, 18.0, told, turning=np.radians(2.0))
+    state, after = oscillated(3.0, 1.2 * np.sqrt(2.0) * limit, 18.0, told, turning=np.radians(3.0))
     assert state["pid"]["halvings"] == 2 and stop_of(state)[0] == Cause.OSCILLATES and 1.2 < after < 1.5
-    calm, _ = oscillated(3.0, 0.6 * np.sqrt(2.0) * limit, 18.0, told, turning=np.radians(1.0))
+    calm, _ = oscillated(3.0, 0.6 * np.sqrt(2.0) * limit, 18.0, told, turning=np.radians(2.0))
     assert calm["pid"]["halvings"] == 0
 
 
