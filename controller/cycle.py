@@ -136,7 +136,7 @@ RUNNING_LIMITS: Limits = {
     "safety.stop.earlier_cause": (Cause.NONE, Cause.NONE),
     "safety.arming.obstacle": (Cause.NONE, max(Cause)),
     "safety.events.count": (0, 0),
-    "pid.halvings": (0, MOST),
+    "pid.halvings": (0, pid.MOST_HALVINGS),
     **{f"integrity.{name}": limits for name, limits in integrity.LIMITS.items()},
 }
 """The same of the state between two cycles of a run that is not stopping."""

@@ -14,6 +14,9 @@ from plant.compiled import Record, filled, kernel, record_dtype
 from plant.mechanism import LEGS
 from plant.pose import Array
 
+MOST_HALVINGS = 2
+"""So often may the gains be halved."""
+
 PARAMETERS = record_dtype(
     gains=(np.float64, 4),  # Kp [1/s], Ki [1/s^2], Kd [-], and the corner of the derivative's low-pass [rad/s]
     limit=np.float64,  # largest command [m/s]
@@ -26,7 +29,7 @@ STATE = record_dtype(
     previous_error=(np.float64, LEGS),
     derivative=(np.float64, LEGS),  # of the error, low-passed [m/s]
     command=(np.float64, LEGS),  # [m/s]
-    halvings=np.int64,  # how often the gains have been halved
+    halvings=np.int64,  # how often the gains have been halved, at most `MOST_HALVINGS`
 )
 """The state of each controller."""
 

@@ -189,7 +189,7 @@ class Cause(IntEnum):
     )
     GAINS_HALVED = (
         85,
-        "the gains are halved, as the commands oscillate, most of all that of leg {}: it has play, or the gains are too high",
+        "the gains are halved, as the commands oscillate, most of all that of leg {}: legs have play, or gains are too high",
         Reaction.GO_ON,
         "m/s RMS",
     )

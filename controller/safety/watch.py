@@ -6,7 +6,7 @@ import numpy as np
 
 from controller.estimation.imu_monitor import contradiction, reset
 from controller.estimation.integrity.parity import OF_TWO, SHARED
-from controller.pid import halve_gains
+from controller.pid import MOST_HALVINGS, halve_gains
 from controller.rig import elapsed
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
@@ -63,10 +63,9 @@ such one on. In that time evidence leaves out no other IMU. The pose follows the
 is off, and at last a leg's IMU may seem to contradict the others more.
 """
 
-_FIRST_COUNTED, _FIRST_ADDED = 20, 30
-"""From which evaluation on these rules count, and from which on the sum is taken: until then nothing has been learned, and what
-a calibration does not know, such as clocks of the IMUs' own, is left unexplained, above all at low rates. Where legs have play,
-what their motors do as the brakes open looks like an error of the platform's IMU for some two seconds.
+_FIRST_COUNTED = 20
+"""From which evaluation on these rules count. Until then nothing has been learned, and what a calibration does not know is left
+unexplained, such as clocks of the IMUs' own, above all at low rates.
 """
 
 _NEARLY = 0.7
@@ -87,14 +86,10 @@ _FAST_S = 0.1
 _OSCILLATING_S = 1.0
 """For how long a mean square must be beyond its limit: a step of the estimate is corrected in less [s]."""
 
-_HALVINGS = 2
-"""So many times the gains are halved, beyond a quarter and a half of the limit (RMS) for a quarter and a half of this time. So
-many times it is beyond, so much sooner they are.
-"""
-
 _TURNING = radians(2.2)
-"""If the platform turns to and fro faster than this [rad/s RMS], beyond what is planned, it oscillates indeed. Else only IMUs
-are shaken, and lower gains do not help.
+"""If the platform turns to and fro by more than this [rad/s RMS] beyond what is planned, it oscillates. Then the gains are
+halved: at first beyond a quarter of the limit (RMS) for a quarter of that time, then beyond a half for a half. Twice as far
+beyond, it takes half the time. If the platform does not turn, only IMUs are shaken, and lower gains do not help.
 """
 
 _BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0
@@ -145,8 +140,8 @@ STATE = record_dtype(
     correction=(np.float64, LEGS),  # of each command beyond its feed-forward, averaged [m/s]
     oscillation=(np.float64, LEGS),  # square of what the correction is apart from that, averaged [m^2/s^2]
     oscillating_for=np.float64,  # how long the mean of these squares has been beyond its limit [s]
-    turn=(np.float64, 3),  # mean angular velocity beyond the planned one [rad/s]
-    turning=np.float64,  # mean square of what it has beyond that [rad^2/s^2]
+    turn=(np.float64, 3),  # angular velocity beyond the planned one, averaged [rad/s]
+    turning=(np.float64, 3),  # square of what it is apart from that, averaged [rad^2/s^2]
     speed=(np.float64, LEGS),  # estimated, of each leg [m/s]
     variance=(np.float64, 2),  # of the least known direction, of the leg filters and of the whole-mechanism filter [rad^2]
     calm_variance=(np.float64, 2),  # the same when nothing shook the IMUs last
@@ -317,28 +312,20 @@ def check_oscillation(
     Args:
         twist: (6,), of the platform beyond the planned one, by all gyroscopes [m/s, rad/s].
     """
-    w = s.watch
-    share = min(1.0, elapsed(rig, time) / _FAST_S)
-    total, worst = 0.0, 0
+    w, passed, worst = s.watch, elapsed(rig, time), 0
+    share = min(1.0, passed / _FAST_S)
     for k in range(rig.legs):
-        off = pid.command[k] - feed_forward[k] - w.correction[k]
-        w.correction[k] += share * off
-        w.oscillation[k] += share * (off * off - w.oscillation[k])
-        total += w.oscillation[k]
+        _take_oscillation(share, pid.command[k] - feed_forward[k], k, w.correction, w.oscillation)
         if w.oscillation[k] > w.oscillation[worst]:
             worst = k
-    squared = 0.0
     for i in range(3):
-        beyond = twist[3 + i] - w.turn[i]
-        w.turn[i] += share * beyond
-        squared += beyond * beyond
-    w.turning += share * (squared - w.turning)
-    turns = w.turning > _TURNING**2
-    left = _HALVINGS - pid.halvings if turns else 0
-    rms, limit = np.sqrt(total / rig.legs), np.sqrt(p.watch.oscillation) / 2**left
-    oscillates = rms > limit and (turns or shaking.told != 0) and s.mode == Mode.RUNNING
+        _take_oscillation(share, twist[3 + i], i, w.turn, w.turning)
+    rms, turning = np.sqrt(w.oscillation[: rig.legs].mean()), np.sqrt(w.turning.sum())
+    left = MOST_HALVINGS - pid.halvings if turning > _TURNING else 0
+    limit = np.sqrt(p.watch.oscillation) / 2**left
+    oscillates = rms > limit and (turning > _TURNING or shaking.told != 0) and s.mode == Mode.RUNNING
     sooner = rms / limit if left > 0 else 1.0
-    w.oscillating_for = w.oscillating_for + elapsed(rig, time) * sooner if oscillates else 0.0
+    w.oscillating_for = w.oscillating_for + passed * sooner if oscillates else 0.0
     if w.oscillating_for > _OSCILLATING_S / 2**left:
         w.oscillating_for = 0.0
         if left > 0:
@@ -346,6 +333,14 @@ def check_oscillation(
             report_event(s.events, Cause.GAINS_HALVED, worst, rms, limit)
         else:
             handle_cause(p, s, rig, time, reference, pid, Cause.OSCILLATES, worst, rms, limit)
+
+
+@kernel
+def _take_oscillation(share: float, value: float, k: int, mean: Array, square: Array) -> None:
+    """Average a value into `mean[k]`, and the square of its distance from that mean into `square[k]`."""
+    off = value - mean[k]
+    mean[k] += share * off
+    square[k] += share * (off * off - square[k])
 
 
 @kernel
@@ -506,14 +501,14 @@ def _count_evaluations(p: Record, w: Record, e: Record, rest: float, usual_rest:
     """Count the evaluations in a row that leave too much unexplained; and add up the evidence against the platform's IMU, if it
     is needed.
     """
-    counts, adds, sigma = e.evaluations >= _FIRST_COUNTED, e.evaluations >= _FIRST_ADDED, np.sqrt(p.evidence)
+    counts, sigma = e.evaluations >= _FIRST_COUNTED, np.sqrt(p.evidence)
     most_rest, most = _UNEXPLAINED * p.evidence + usual_rest, _CONTRADICTED * sigma
     w.unexplained_for = w.unexplained_for + 1 if counts and rest >= most_rest else 0
     found = e.platform_evidence if e.platform_evidence >= _OF_BEST * e.best_evidence else 0.0
     beyond = np.sqrt(max(found, 0.0)) - _USUAL * sigma
     # What adds up on the brakes may delay arming by a limited time only.
     added = min(max(w.against_platform + beyond, 0.0), 2.0 * most)
-    w.against_platform = added if adds and _is_needed(p, PLATFORM_IMU) else 0.0
+    w.against_platform = added if counts and _is_needed(p, PLATFORM_IMU) else 0.0
     suspected = w.against_platform >= _SUSPECTED * sigma
     w.suspicion = _SUSPICION_EVALUATIONS if suspected else max(w.suspicion - 1, 0)
     w.lasting[:] = 0.0

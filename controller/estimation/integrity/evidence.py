@@ -51,6 +51,11 @@ _POSE_ERRORS = 1.5e-4, 3e-3
 standard deviations of a gyroscope and an accelerometer [rad/s, m/s^2].
 """
 
+_SHARED_CHANGE = radians(0.015)
+"""By how much the constant errors of all gyroscopes change alike, as they share the supply: standard deviation [rad/s].
+20 mV change an MPU-9150 by some 0.02 deg/s (`plant.imu.presets`).
+"""
+
 _LARGEST = 0.1, 5.0
 """Standard deviation of a fault about which the readings say nothing [rad/s, m/s^2]."""
 
@@ -69,6 +74,7 @@ PARAMETERS = record_dtype(
     share=np.float64,  # of the information of the last half second that is new at such a time
     keep=np.float64,  # what is left of the information that was learned before
     stiffness=(np.float64, 2),  # inverse variance of the change of a constant error from pose to pose
+    shared_stiffness=np.float64,  # and of the change that all gyroscopes share
     least=(np.float64, 2),  # information on a fault about which the readings say nothing
 )
 """Constants."""
@@ -102,11 +108,12 @@ STATE = record_dtype(
 """State and scratch."""
 
 
+_BLURS = IMU_COUNT + 1
 _BEGIN, _BUILD = 0, 1 + REST
 _APART = _BUILD + 1 + FAULTS
 _TAKE = _APART + 1 + POSE
 _LEARN = _TAKE + 1
-STEPS = _LEARN + 1 + IMU_COUNT
+STEPS = _LEARN + 1 + _BLURS
 """Steps of an evaluation: copying the last half second, eliminating the rest of its motion, putting the system together,
 eliminating the errors learned and what is left out, keeping what ties the pose to faults, eliminating the pose, and learning.
 """
@@ -131,6 +138,7 @@ def evidence_parameters(prior: Array, window: float) -> Record:
         share=between * window / MEMORY_S,
         keep=np.exp(-between * window / _LEARNED_S),
         stiffness=1.0 / np.square(_POSE_ERRORS),
+        shared_stiffness=1.0 / _SHARED_CHANGE**2,
         least=1.0 / np.square(_LARGEST),
     )
 
@@ -395,21 +403,43 @@ def _learn(p: Record, s: Record) -> None:
 def end_blur(p: Record, s: Record, step: int) -> None:
     """Blur what was just learned of the IMUs that an evaluation which is broken off before this step has not reached."""
     if s.windows == 0:
-        for k in range(max(step - _LEARN - 1, 0) if step > _LEARN else IMU_COUNT, IMU_COUNT):
+        for k in range(max(step - _LEARN - 1, 0) if step > _LEARN else _BLURS, _BLURS):
             _blur(p, s, k)
 
 
 @kernel
 def _blur(p: Record, s: Record, k: int) -> None:
-    """Let the errors of IMU `k` be others at another pose."""
-    a, y = s.expected, s.expected_vector
-    for fault in range(READINGS * k, READINGS * (k + 1)):
-        row, scratch = a[fault], s.row
-        share = 1.0 / (row[fault] + p.stiffness[fault % READINGS // 3])
-        scratch[:] = row
-        size = y[fault]
-        for i in range(FAULTS):
-            other, part = a[i], share * scratch[i]
+    """Let the errors of IMU `k` be others at another pose; at last, let the errors of all gyroscopes change alike."""
+    if k < IMU_COUNT:
+        for fault in range(READINGS * k, READINGS * (k + 1)):
+            s.row[:] = s.expected[fault]
+            _let_change(s, s.row[fault], s.expected_vector[fault], p.stiffness[fault % READINGS // 3])
+        return
+    for axis in range(3):
+        s.row[:] = 0.0
+        known = size = 0.0
+        for fault in range(axis, FAULTS, READINGS):
+            size += s.expected_vector[fault]
             for j in range(FAULTS):
-                other[j] -= part * scratch[j]
-            y[i] -= part * size
+                s.row[j] += s.expected[fault, j]
+        for fault in range(axis, FAULTS, READINGS):
+            known += s.row[fault]
+        _let_change(s, known, size, p.shared_stiffness)
+
+
+@kernel
+def _let_change(s: Record, known: float, size: float, stiffness: float) -> None:
+    """Forget some of what is expected in a direction u.
+
+    Args:
+        s: dtype `STATE`, with the information times u in `row`.
+        known, size: u^T times this, and u^T times the vector.
+        stiffness: inverse variance of the change along u.
+    """
+    a, y = s.expected, s.expected_vector
+    share = 1.0 / (known + stiffness)
+    for i in range(FAULTS):
+        other, part = a[i], share * s.row[i]
+        for j in range(FAULTS):
+            other[j] -= part * s.row[j]
+        y[i] -= part * size

@@ -5,7 +5,7 @@ The loop has a pose, whichever fusion found it. The truth is off by a small erro
 information form: Y x = y for x = (m, f), which begins with nothing known. Of a window of T seconds,
 
     carry    Y <- Phi^-T Y Phi^-1, y <- Phi^-T y + Y d      Phi: constant acceleration; d: how the loop's pose left the plan
-    forget   Y <- Y - Z^T Z, y <- y - Z^T u                 white jerk; then Y and y fade with `MEMORY_S`
+    forget   Y <- Y - Z^T Z, y <- y - Z^T u                 white jerk, more if `parity` shows it; all fades with `MEMORY_S`
     update   Y <- Y + H^T R^-1 H, y <- y + H^T R^-1 z       z: mean reading less what the loop's pose predicts; H = (J, 1)
 
 so that Y and y hold what the last half second says about f, and how much the pose depends on that. A window that a missed
@@ -57,6 +57,11 @@ _STEADY_FEEDBACK = 0.5
 
 _TIMING_S = 3e-4
 """How far the times of samples may be off, as IMUs have clocks of their own [s]."""
+
+_OF_RESTLESS = 0.15
+"""A mean force is off by this share of the change of the acceleration from one window to the next, as far as that was not
+planned: the filter takes the acceleration to change evenly. The share fits a platform that goes to and fro at 20 Hz.
+"""
 
 _BRIDGED_WINDOWS = 3
 """How much time between two windows may be lost by missed periods [windows]: a longer gap ends in a new beginning."""
@@ -132,6 +137,8 @@ STATE = record_dtype(
     counted=(np.int64, IMU_COUNT),  # whether the IMU gave enough of them
     turning=np.float64,  # greatest angular acceleration of platform and legs that was planned for it [rad/s^2]
     rough=np.float64,  # standard deviation of a mean specific force by what is not known of the motion [m/s^2]
+    restless=(np.float64, 2),  # by `parity`: mean squares of the changes of acceleration between windows that were not planned,
+    # of an IMU [m^2/s^4], and angular [rad^2/s^4]
     weight=(np.float64, (IMU_COUNT, 2)),  # of the means, angular velocity and specific force
     information=(np.float64, (UNKNOWNS, UNKNOWNS)),
     vector=(np.float64, UNKNOWNS),
@@ -297,10 +304,11 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         s.counted[k] = _LEAST_SAMPLES * s.samples[k] >= s.collected or (s.samples[k] > 1 and even)
         if s.counted[k] == 0:
             continue
+        unknown = s.rough**2 + corrected**2 + _OF_RESTLESS**2 * s.restless[0]
         shaken = shaking.excess[ACCELEROMETER, k] + shaking.hidden[k] + shaking.mean[k]
         # What shakes an IMU beyond its noise makes its mean as uncertain.
         s.weight[k, 0] = s.samples[k] / (max(p.variance[0], variance[0, k]) + p.window * (_TIMING_S * turning) ** 2)
-        s.weight[k, 1] = s.samples[k] / (max(p.variance[1], variance[1, k]) + p.window * (s.rough**2 + corrected**2 + shaken))
+        s.weight[k, 1] = s.samples[k] / (max(p.variance[1], variance[1, k]) + p.window * (unknown + shaken))
         for i in range(READINGS):
             s.mean[k, i] = s.sum[k, i] / s.samples[k]
         place = s.places[k] / p.window
@@ -407,7 +415,10 @@ def _forget(p: Record, s: Record, information: Array, vector: Array) -> None:
     for n in range(_JERKS):
         for m in range(_JERKS):
             s.factor[n, m] = by_place * z[n, m] + by_speed * z[n, 6 + m] + t * z[n, 12 + m]
-        s.factor[n, n] += p.stiffness[n // 3] * (_CATCHING_UP_STIFFNESS if s.catching_up != 0 else 1.0)
+        stiffness = p.stiffness[n // 3]
+        if s.catching_up != 0:
+            stiffness *= _CATCHING_UP_STIFFNESS
+        s.factor[n, n] += stiffness / (1.0 + stiffness * s.restless[n // 3] / (p.duration * p.duration))
     _take_away(s, information, vector, p.keep ** (t / p.duration))
     if s.follows == 0 and s.jumped > _LEAST_JUMP:
         for first, per in ((6, 1.0), (12, p.duration)):

@@ -8,6 +8,9 @@ gyroscope is off, however much the fit follows it. A gyroscope is named if the r
 which gives J three more columns, explains them about as well. What a gyroscope has been off for many seconds is no large error:
 it is left to the evidence.
 
+Where t changes unevenly, the platform moves otherwise than planned: the loop may chatter in the mechanism's play. The fault
+filter then expects more jerk, and relies less on mean forces.
+
 From one window to the next, t changes with the acceleration that was not planned, averaged with weights that rise in the first
 window and fall in the second one. If the forces, averaged alike, show more than that, it is no motion: it is vibration, or
 accelerometers are off, perhaps all alike. They then count less at once. If all of them go on to show it, or two show more, the
@@ -58,6 +61,9 @@ _FORCE_LIMIT, _ROUGH_SIGMAS = 0.9, 3.0
 _ENOUGH = 5
 """So many gyroscopes know the change of the twist well enough for that."""
 
+_RESTLESS_S = 0.1
+"""Time constant over which the change of the acceleration that was not planned is averaged [s]."""
+
 _AVERAGED = 0.25
 """Share of a window in the average of such errors."""
 
@@ -87,7 +93,10 @@ STATE = record_dtype(
     twist_before=(np.float64, _TWIST),  # of the window before
     force_before=(np.float64, (IMU_COUNT, 3)),  # its part in the forces beyond the planned acceleration and the twist
     twist=(np.float64, _TWIST),  # of this one, beyond the planned one
-    normal=(np.float64, (_WITH_BASE, _WITH_BASE)),  # from here on scratch
+    acceleration=(np.float64, _TWIST),  # its change since the window before, per second
+    followed=np.int64,  # whether this one followed that one directly
+    jerked=(np.float64, _TWIST),  # from here on scratch: how much that has changed since
+    normal=(np.float64, (_WITH_BASE, _WITH_BASE)),
     covariance=(np.float64, (_WITH_BASE, _WITH_BASE)),  # of what is fitted, for gyroscopes of variance 1
     fit=(np.float64, _WITH_BASE),  # twist and base's rate
     rows=(np.float64, (IMU_COUNT, 3, _WITH_BASE)),  # of J: what the twist adds to each reading, and the base's rate
@@ -126,6 +135,7 @@ def step_parity(
     s.limit = least + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
     if s.error <= s.limit:
         _learn_usual(s, f, excluded, duration / _USUAL_S)
+    _average_restlessness(s, f, duration)
     _compare_forces(s, f, excluded, samples, duration, shaking)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
@@ -229,6 +239,31 @@ def _unplanned_turning(s: Record, f: Record, duration: float) -> float:
             squared += change * change
         most = max(most, squared)
     return float(np.sqrt(most) / duration)
+
+
+@kernel
+def _average_restlessness(s: Record, f: Record, duration: float) -> None:
+    """Average how much the acceleration that was not planned changes from window to window, where it changes most."""
+    for i in range(_TWIST):
+        acceleration = (s.twist[i] - s.twist_before[i]) / duration
+        s.jerked[i] = acceleration - s.acceleration[i]
+        s.acceleration[i] = acceleration
+    linear = angular = 0.0
+    for k in range(IMU_COUNT):
+        squared = 0.0
+        for m in range(3):
+            change = 0.0
+            for i in range(_TWIST):
+                change += f.jacobian[k, 3 + m, _FIRST + _TWIST + i] * s.jerked[i]
+            squared += change * change
+        linear = max(linear, squared)
+    for i in range(3, _TWIST):
+        angular += s.jerked[i] ** 2
+    if f.follows != 0 and s.followed != 0:
+        share = min(1.0, duration / _RESTLESS_S)
+        f.restless[0] += share * (linear - f.restless[0])
+        f.restless[1] += share * (angular - f.restless[1])
+    s.followed = f.follows
 
 
 @kernel

@@ -719,10 +719,10 @@ def test_evidence_that_adds_up_against_the_platforms_imu_ends_a_motion(imu, need
     if not needed:
         parameters["safety"]["watch"]["without_platform_imu"] = np.inf
     weigh(state, imu, evidence, 7.0, platform=platform)
-    # The first three seconds do not count.
-    state["integrity"]["evaluations"] = 29
+    # The first two seconds do not count.
+    state["integrity"]["evaluations"] = 19
     assert evaluations_until_a_stop(parameters, state) is None
-    state["integrity"]["evaluations"] = 30
+    state["integrity"]["evaluations"] = 20
     assert evaluations_until_a_stop(parameters, state) == expected
     if expected:
         added = expected * ((platform or evidence) - 3.0)
@@ -735,7 +735,7 @@ def test_evidence_that_adds_up_against_the_platforms_imu_ends_a_motion(imu, need
 def test_less_evidence_against_the_platforms_imu_takes_off_from_the_sum(between, expected):
     """Evaluations with 4.6 and less sigma take turns; what was learned does not count."""
     _, parameters, state = moving()
-    state["integrity"]["evaluations"] = 30
+    state["integrity"]["evaluations"] = 20
     ended = None
     for n in range(40):
         high = n % 2 == 0
@@ -752,7 +752,7 @@ def test_less_evidence_against_the_platforms_imu_takes_off_from_the_sum(between,
 def test_a_sum_that_ends_a_motion_does_so_beside_more_evidence_that_names_no_imu_clearly():
     """Without the sum, more evidence would be awaited: something else explains the readings as well."""
     _, parameters, state = moving()
-    state["integrity"]["evaluations"] = 30
+    state["integrity"]["evaluations"] = 20
     weigh(state, 2, 8.5, 9.0, rival=8.4, platform=6.2)
     assert evaluations_until_a_stop(parameters, state) == 2
     assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(6.4), pytest.approx(6.0))
@@ -764,7 +764,7 @@ def test_a_sum_that_grew_on_the_brakes_delays_arming_by_a_limited_time():
     """It is kept below twice its limit, and 2 sigma take off 1 each time."""
     _, parameters, state = moving(mode=Mode.IDLE)
     watch = state["safety"]["watch"]
-    state["integrity"]["evaluations"] = 30
+    state["integrity"]["evaluations"] = 20
     weigh(state, 3, 9.0, 9.0, platform=8.0)
     for _ in range(100):
         assert not judge(parameters, state)

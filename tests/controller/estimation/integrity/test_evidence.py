@@ -108,4 +108,19 @@ def test_learning_is_late_and_fades():
     assert p["learning_windows"] == 50
     assert p["share"] == pytest.approx(1.0)
     assert p["keep"] == pytest.approx(np.exp(-0.5 / 10.0))
-    assert evidence.STEPS == 12 + 42 + 6 + 5 + 7
+    assert evidence.STEPS == 12 + 42 + 6 + 5 + 8
+
+
+def test_errors_may_change_each_by_itself_and_those_of_all_gyroscopes_alike():
+    """What is expected beside dense algebra: covariances add, and the estimate stays."""
+    parameters, state = evaluated()
+    e, eye = state["integrity"]["evidence"], np.eye(3)
+    for _ in range(4):
+        evaluate(parameters, state)
+    assert e["windows"] == 0 and e["waits"] > 0
+    each = np.tile(np.repeat(np.square([1.5e-4, 3e-3]), 3), 7)
+    alike = np.tile(np.hstack([eye, 0.0 * eye]), 7)
+    covariance = np.linalg.inv(e["learned"]) + np.diag(each) + np.radians(0.015) ** 2 * alike.T @ alike
+    np.testing.assert_allclose(e["expected"] @ covariance, np.eye(FAULTS), atol=1e-6)
+    expected, learned = (np.linalg.solve(e[name], e[f"{name}_vector"]) for name in ("expected", "learned"))
+    np.testing.assert_allclose(expected, learned, atol=1e-6 * np.abs(learned).max())

@@ -100,7 +100,8 @@ def test_it_forgets():
 @pytest.mark.parametrize("jumped", [0.0, 1e-12, 2e-4, 0.01])
 @pytest.mark.parametrize("catching_up", [False, True])
 @pytest.mark.parametrize("follows", [False, True])
-def test_what_jerk_and_jumps_take_away_is_what_they_add_to_the_covariance(follows, catching_up, jumped):
+@pytest.mark.parametrize("restless", [(0.0, 0.0), (4.0, 25.0)])
+def test_what_jerk_and_jumps_take_away_is_what_they_add_to_the_covariance(restless, follows, catching_up, jumped):
     """Y^-1 becomes (Y^-1 + G Q G^T) / keep, and after a gap the variances of jumps are added to it."""
     mechanism, _ = readings("static", 0.1)
     parameters, state = constants(mechanism)
@@ -114,11 +115,13 @@ def test_what_jerk_and_jumps_take_away_is_what_they_add_to_the_covariance(follow
     f["information"] = np.linalg.inv(covariance)
     f["vector"] = f["information"] @ estimate
     f["between"], f["follows"], f["catching_up"], f["jumped"] = 0.02, follows, catching_up, jumped
+    f["restless"] = restless
     _forget(p, f, f["information"], f["vector"])
     t, eye = 0.02, np.eye(6)
     by_jerk = np.vstack([t**3 / 6.0 * eye, 0.5 * t**2 * eye, t * eye, np.zeros((FAULTS, 6))])
     stiffness = np.repeat(p["stiffness"], 3) * (_CATCHING_UP_STIFFNESS if catching_up else 1.0)
-    expected = (covariance + by_jerk / stiffness @ by_jerk.T) * np.exp(t / MEMORY_S)
+    jerk = 1.0 / stiffness + np.repeat(restless, 3) / p["duration"] ** 2
+    expected = (covariance + by_jerk * jerk @ by_jerk.T) * np.exp(t / MEMORY_S)
     if jumped > 1e-9 and not follows:
         jumps = np.repeat(np.array(_JUMPS) * jumped, 3)
         expected += np.diag(np.r_[np.zeros(6), jumps**2, (jumps / p["duration"]) ** 2, np.zeros(FAULTS)])

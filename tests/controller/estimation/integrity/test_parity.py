@@ -221,7 +221,7 @@ def test_the_change_of_the_gyroscopes_twist_is_the_acceleration_that_was_not_pla
     mechanism, r = readings("mixed", 1.0, 3)
     r.samples[:, 1, 2] += [0.4, -0.2, 0.3]
     parameters, state = constants(mechanism)
-    f, found = state["integrity"]["filter"], []
+    f, found, restless = state["integrity"]["filter"], [], np.zeros(2)
     for n in range(6):
         part = type(r)(*(each[5 * n + (n > 0) : 5 * n + 6] for each in vars(r).values()))
         filtered(mechanism, part, parameters, state)
@@ -235,6 +235,12 @@ def test_the_change_of_the_gyroscopes_twist_is_the_acceleration_that_was_not_pla
             (before, force, rises), (_, now, falls) = found[-2:]
             beyond = 0.5 * (force + rises + now - falls) - j[:, 3:, 12:] @ (twist - before) * RATE_HZ / 5
             np.testing.assert_allclose(state["integrity"]["parity"]["off_motion"], np.linalg.norm(beyond, axis=1), rtol=1e-5)
+        if n > 1:
+            first, second, third = (twist for twist, *_ in found[-3:])
+            jerked = (third - 2.0 * second + first) * RATE_HZ / 5
+            squares = [np.square(j[:, 3:, 12:] @ jerked).sum(axis=1).max(), np.square(jerked[3:]).sum()]
+            restless += 0.1 * (np.array(squares) - restless)
+        np.testing.assert_allclose(f["restless"], restless, rtol=1e-5)
 
 
 def test_what_is_left_out_shows_no_force():
