@@ -53,7 +53,7 @@ standard deviations of a gyroscope and an accelerometer [rad/s, m/s^2].
 
 _SHARED_CHANGE = radians(0.015)
 """By how much the constant errors of all gyroscopes change alike, as they share the supply: standard deviation [rad/s].
-20 mV change an MPU-9150 by some 0.02 deg/s (`plant.imu.presets`).
+20 mV change an MPU-9150 by 0.04 deg/s, half of it alike (`plant.imu.presets`).
 """
 
 _LARGEST = 0.1, 5.0
@@ -401,7 +401,7 @@ def _learn(p: Record, s: Record) -> None:
 
 @kernel
 def end_blur(p: Record, s: Record, step: int) -> None:
-    """Blur what was just learned of the IMUs that an evaluation which is broken off before this step has not reached."""
+    """Do what an evaluation that is broken off before this step has not done to blur what was just learned."""
     if s.windows == 0:
         for k in range(max(step - _LEARN - 1, 0) if step > _LEARN else _BLURS, _BLURS):
             _blur(p, s, k)
@@ -409,7 +409,7 @@ def end_blur(p: Record, s: Record, step: int) -> None:
 
 @kernel
 def _blur(p: Record, s: Record, k: int) -> None:
-    """Let the errors of IMU `k` be others at another pose; at last, let the errors of all gyroscopes change alike."""
+    """Let the errors of IMU `k` (0 to 6) be others at another pose, or with 7 those of all gyroscopes change alike."""
     if k < IMU_COUNT:
         for fault in range(READINGS * k, READINGS * (k + 1)):
             s.row[:] = s.expected[fault]

@@ -8,8 +8,8 @@ gyroscope is off, however much the fit follows it. A gyroscope is named if the r
 which gives J three more columns, explains them about as well. What a gyroscope has been off for many seconds is no large error:
 it is left to the evidence.
 
-Where t changes unevenly, the platform moves otherwise than planned: the loop may chatter in the mechanism's play. The fault
-filter then expects more jerk, and relies less on mean forces.
+Where t changes unevenly, the acceleration that was not planned is not steady: the loop may chatter in the mechanism's play. The
+fault filter then expects more jerk, and relies less on mean forces.
 
 From one window to the next, t changes with the acceleration that was not planned, averaged with weights that rise in the first
 window and fall in the second one. If the forces, averaged alike, show more than that, it is no motion: it is vibration, or
@@ -94,7 +94,7 @@ STATE = record_dtype(
     force_before=(np.float64, (IMU_COUNT, 3)),  # its part in the forces beyond the planned acceleration and the twist
     twist=(np.float64, _TWIST),  # of this one, beyond the planned one
     acceleration=(np.float64, _TWIST),  # its change since the window before, per second
-    followed=np.int64,  # whether this one followed that one directly
+    known_for=np.int64,  # in how many windows in direct succession it has been known well enough
     jerked=(np.float64, _TWIST),  # from here on scratch: how much that has changed since
     normal=(np.float64, (_WITH_BASE, _WITH_BASE)),
     covariance=(np.float64, (_WITH_BASE, _WITH_BASE)),  # of what is fitted, for gyroscopes of variance 1
@@ -135,7 +135,7 @@ def step_parity(
     s.limit = least + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
     if s.error <= s.limit:
         _learn_usual(s, f, excluded, duration / _USUAL_S)
-    _average_restlessness(s, f, duration)
+    _average_restlessness(s, f, excluded, worst >= 0, duration)
     _compare_forces(s, f, excluded, samples, duration, shaking)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
@@ -242,8 +242,18 @@ def _unplanned_turning(s: Record, f: Record, duration: float) -> float:
 
 
 @kernel
-def _average_restlessness(s: Record, f: Record, duration: float) -> None:
-    """Average how much the acceleration that was not planned changes from window to window, where it changes most."""
+def _average_restlessness(s: Record, f: Record, excluded: Array, fits: bool, duration: float) -> None:
+    """Average how much the acceleration that was not planned changes from window to window, where windows follow each other.
+
+    It does not count where too few gyroscopes know it.
+    """
+    used = 0
+    for k in range(IMU_COUNT):
+        used += _counts(f, excluded, k)
+    if fits and used >= _ENOUGH:
+        s.known_for = s.known_for + 1 if f.follows != 0 else 1
+    else:
+        s.known_for = 0
     for i in range(_TWIST):
         acceleration = (s.twist[i] - s.twist_before[i]) / duration
         s.jerked[i] = acceleration - s.acceleration[i]
@@ -259,11 +269,10 @@ def _average_restlessness(s: Record, f: Record, duration: float) -> None:
         linear = max(linear, squared)
     for i in range(3, _TWIST):
         angular += s.jerked[i] ** 2
-    if f.follows != 0 and s.followed != 0:
+    if s.known_for > 2 and np.isfinite(linear + angular):
         share = min(1.0, duration / _RESTLESS_S)
         f.restless[0] += share * (linear - f.restless[0])
         f.restless[1] += share * (angular - f.restless[1])
-    s.followed = f.follows
 
 
 @kernel

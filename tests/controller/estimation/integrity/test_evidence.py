@@ -115,6 +115,7 @@ def test_errors_may_change_each_by_itself_and_those_of_all_gyroscopes_alike():
     """What is expected beside dense algebra: covariances add, and the estimate stays."""
     parameters, state = evaluated()
     e, eye = state["integrity"]["evidence"], np.eye(3)
+    e["learned_vector"] = np.random.default_rng(0).normal(0.0, 1e3, FAULTS)
     for _ in range(4):
         evaluate(parameters, state)
     assert e["windows"] == 0 and e["waits"] > 0
@@ -124,3 +125,4 @@ def test_errors_may_change_each_by_itself_and_those_of_all_gyroscopes_alike():
     np.testing.assert_allclose(e["expected"] @ covariance, np.eye(FAULTS), atol=1e-6)
     expected, learned = (np.linalg.solve(e[name], e[f"{name}_vector"]) for name in ("expected", "learned"))
     np.testing.assert_allclose(expected, learned, atol=1e-6 * np.abs(learned).max())
+    assert np.abs(learned).max() > 1e-3

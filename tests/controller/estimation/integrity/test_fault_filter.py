@@ -132,6 +132,19 @@ def test_what_jerk_and_jumps_take_away_is_what_they_add_to_the_covariance(restle
     np.testing.assert_allclose(believed / deviations, estimate / deviations, rtol=1e-5, atol=1e-5)
 
 
+def test_a_mean_force_counts_less_where_the_acceleration_is_not_steady():
+    weights = []
+    for restless in (0.0, 4.0):
+        mechanism, r = readings("static", 0.1)
+        parameters, state = constants(mechanism)
+        state["integrity"]["filter"]["restless"][0] = restless
+        filtered(mechanism, r, parameters, state)
+        weights.append(state["integrity"]["filter"]["weight"].copy())
+    (calm, uneasy), window = weights, 5
+    np.testing.assert_allclose(uneasy[:, 0], calm[:, 0])
+    np.testing.assert_allclose(window / uneasy[:, 1] - window / calm[:, 1], window * 0.15**2 * 4.0, rtol=1e-9)
+
+
 def test_drives_catch_up_for_some_windows_after_a_gap_and_not_before():
     """The window before a gap, whose work is not done yet when periods are missed, keeps what is known of its jerk."""
     mechanism, r = readings("0.5", 1.0, 5)
