@@ -60,8 +60,8 @@ _TIMING_S = 3e-4
 
 _OF_RESTLESS = 0.15
 """A mean force is off by this share of the change of the acceleration from one window to the next, as far as that was not
-planned: the filter takes the acceleration to change evenly. For a platform that
-goes to and fro at 20 Hz it is twice the error.
+planned: the filter takes the acceleration to change evenly. For a platform that goes to and fro at 20 Hz this is twice the
+error, and at 35 Hz the error.
 """
 
 _BRIDGED_WINDOWS = 3
@@ -138,8 +138,8 @@ STATE = record_dtype(
     counted=(np.int64, IMU_COUNT),  # whether the IMU gave enough of them
     turning=np.float64,  # greatest angular acceleration of platform and legs that was planned for it [rad/s^2]
     rough=np.float64,  # standard deviation of a mean specific force by what is not known of the motion [m/s^2]
-    restless=(np.float64, 2),  # by `parity`: mean squares of how much the acceleration that was not planned changes between
-    # windows, of the IMU where that is greatest [m^2/s^4], and of the angular one [rad^2/s^4]
+    restless=(np.float64, 2),  # by `parity`: mean squares of how much the platform's acceleration that was not planned changes
+    # between windows, where its IMU is [m^2/s^4], and of the angular one [rad^2/s^4]
     weight=(np.float64, (IMU_COUNT, 2)),  # of the means, angular velocity and specific force
     information=(np.float64, (UNKNOWNS, UNKNOWNS)),
     vector=(np.float64, UNKNOWNS),

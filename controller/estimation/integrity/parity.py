@@ -25,7 +25,7 @@ import numpy as np
 
 from controller.least_squares import factor_cholesky, invert_cholesky, solve_cholesky
 from plant.compiled import Record, kernel, record_dtype
-from plant.dynamics.variables import IMU_COUNT
+from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
 from plant.pose import Array
 
 _TWIST, _FIRST, _WITH_BASE = 6, 6, 9
@@ -95,7 +95,9 @@ STATE = record_dtype(
     twist=(np.float64, _TWIST),  # of this one, beyond the planned one
     acceleration=(np.float64, _TWIST),  # its change since the window before, per second
     known_for=np.int64,  # in how many windows in direct succession it has been known well enough
-    jerked=(np.float64, _TWIST),  # from here on scratch: how much that has changed since
+    uneven=(np.float64, 2),  # square of that acceleration's change between windows, averaged, less noise: linear, angular
+    jerked=(np.float64, _TWIST),  # from here on scratch: that change
+    changed=(np.float64, 2),  # its squares
     normal=(np.float64, (_WITH_BASE, _WITH_BASE)),
     covariance=(np.float64, (_WITH_BASE, _WITH_BASE)),  # of what is fitted, for gyroscopes of variance 1
     fit=(np.float64, _WITH_BASE),  # twist and base's rate
@@ -135,7 +137,7 @@ def step_parity(
     s.limit = least + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
     if s.error <= s.limit:
         _learn_usual(s, f, excluded, duration / _USUAL_S)
-    _average_restlessness(s, f, excluded, worst >= 0, duration)
+    _average_restlessness(s, f, excluded, worst >= 0, duration, variance / samples)
     _compare_forces(s, f, excluded, samples, duration, shaking)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
@@ -242,10 +244,11 @@ def _unplanned_turning(s: Record, f: Record, duration: float) -> float:
 
 
 @kernel
-def _average_restlessness(s: Record, f: Record, excluded: Array, fits: bool, duration: float) -> None:
+def _average_restlessness(s: Record, f: Record, excluded: Array, fits: bool, duration: float, variance: float) -> None:
     """Average how much the acceleration that was not planned changes from window to window, where windows follow each other.
 
-    It does not count where too few gyroscopes know it.
+    It does not count where too few gyroscopes know it. What their noise adds on average, of this variance in a window's mean
+    [rad^2/s^2], is taken off.
     """
     used = 0
     for k in range(IMU_COUNT):
@@ -254,25 +257,27 @@ def _average_restlessness(s: Record, f: Record, excluded: Array, fits: bool, dur
         s.known_for = s.known_for + 1 if f.follows != 0 else 1
     else:
         s.known_for = 0
+    # The change of a difference counts the middle one of three means twice.
+    noise = 6.0 * variance / duration**2
+    s.changed[:] = 0.0
     for i in range(_TWIST):
         acceleration = (s.twist[i] - s.twist_before[i]) / duration
         s.jerked[i] = acceleration - s.acceleration[i]
         s.acceleration[i] = acceleration
-    linear = angular = 0.0
-    for k in range(IMU_COUNT):
-        squared = 0.0
-        for m in range(3):
-            change = 0.0
-            for i in range(_TWIST):
-                change += f.jacobian[k, 3 + m, _FIRST + _TWIST + i] * s.jerked[i]
-            squared += change * change
-        linear = max(linear, squared)
-    for i in range(3, _TWIST):
-        angular += s.jerked[i] ** 2
-    if s.known_for > 2 and np.isfinite(linear + angular):
-        share = min(1.0, duration / _RESTLESS_S)
-        f.restless[0] += share * (linear - f.restless[0])
-        f.restless[1] += share * (angular - f.restless[1])
+        if i >= 3:
+            s.changed[1] += s.jerked[i] ** 2 - noise * s.covariance[i, i]
+    for m in range(3):
+        row = f.jacobian[PLATFORM_IMU, 3 + m, _FIRST + _TWIST :]
+        change = 0.0
+        for i in range(_TWIST):
+            change += row[i] * s.jerked[i]
+            for j in range(_TWIST):
+                s.changed[0] -= noise * row[i] * s.covariance[i, j] * row[j]
+        s.changed[0] += change * change
+    if s.known_for > 2 and np.isfinite(s.changed[0] + s.changed[1]):
+        for i in range(2):
+            s.uneven[i] += min(1.0, duration / _RESTLESS_S) * (s.changed[i] - s.uneven[i])
+            f.restless[i] = max(s.uneven[i], 0.0)
 
 
 @kernel

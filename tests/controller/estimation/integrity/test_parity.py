@@ -217,15 +217,18 @@ def test_a_force_that_is_no_motion_is_known_in_the_second_window_of_one_imu_or_o
 
 
 def test_the_change_of_the_gyroscopes_twist_is_the_acceleration_that_was_not_planned():
-    """Beside numpy: what two windows' forces show beyond it, with weights that rise in the first and fall in the second."""
+    """Beside numpy: what two windows' forces show beyond it, with weights that rise in the first and fall in the second.
+
+    How unevenly it changes is known less the part of noise.
+    """
     mechanism, r = readings("mixed", 1.0, 3)
     r.samples[:, 1, 2] += [0.4, -0.2, 0.3]
     parameters, state = constants(mechanism)
-    f, found, restless = state["integrity"]["filter"], [], np.zeros(2)
+    f, found, uneven, variance = state["integrity"]["filter"], [], np.zeros(2), 1e-6
     for n in range(6):
         part = type(r)(*(each[5 * n + (n > 0) : 5 * n + 6] for each in vars(r).values()))
         filtered(mechanism, part, parameters, state)
-        parity(state)
+        parity(state, variance)
         z, j = f["mean"] - f["predicted"], f["jacobian"]
         twist = np.linalg.lstsq(j[:, :3, 6:12].reshape(-1, 6), z[:, :3].ravel(), rcond=None)[0]
         forces = r.samples[5 * n : 5 * n + 5, 1]
@@ -238,9 +241,14 @@ def test_the_change_of_the_gyroscopes_twist_is_the_acceleration_that_was_not_pla
         if n > 1:
             first, second, third = (twist for twist, *_ in found[-3:])
             jerked = (third - 2.0 * second + first) * RATE_HZ / 5
-            squares = [np.square(j[:, 3:, 12:] @ jerked).sum(axis=1).max(), np.square(jerked[3:]).sum()]
-            restless += 0.1 * (np.array(squares) - restless)
-        np.testing.assert_allclose(f["restless"], restless, rtol=1e-5)
+            rows = j[:, :3, 6:12].reshape(-1, 6)
+            noise = 6.0 * variance / 5 * (RATE_HZ / 5) ** 2 * np.linalg.inv(rows.T @ rows)
+            force = j[6, 3:, 12:]
+            squares = [np.square(force @ jerked).sum(), np.square(jerked[3:]).sum()]
+            squares = np.array(squares) - [np.trace(force @ noise @ force.T), np.trace(noise[3:, 3:])]
+            uneven += 0.1 * (squares - uneven)
+        np.testing.assert_allclose(state["integrity"]["parity"]["uneven"], uneven, rtol=1e-5)
+        np.testing.assert_allclose(f["restless"], np.maximum(uneven, 0.0), rtol=1e-5)
 
 
 def test_what_is_left_out_shows_no_force():
