@@ -108,12 +108,12 @@ STATE = record_dtype(
 """State and scratch."""
 
 
-_BLURS = IMU_COUNT + 1
+_WIDENINGS = IMU_COUNT + 1
 _BEGIN, _BUILD = 0, 1 + REST
 _APART = _BUILD + 1 + FAULTS
 _TAKE = _APART + 1 + POSE
 _LEARN = _TAKE + 1
-STEPS = _LEARN + 1 + _BLURS
+STEPS = _LEARN + 1 + _WIDENINGS
 """Steps of an evaluation: copying the last half second, eliminating the rest of its motion, putting the system together,
 eliminating the errors learned and what is left out, keeping what ties the pose to faults, eliminating the pose, and learning.
 """
@@ -185,7 +185,7 @@ def step_evidence(p: Record, s: Record, filtered: Record, excluded: Array, step:
     elif step == _LEARN:
         _learn(p, s)
     elif s.windows == 0:
-        _blur(p, s, step - _LEARN - 1)
+        _widen(p, s, step - _LEARN - 1)
 
 
 @kernel
@@ -400,15 +400,15 @@ def _learn(p: Record, s: Record) -> None:
 
 
 @kernel
-def end_blur(p: Record, s: Record, step: int) -> None:
-    """Do what an evaluation that is broken off before this step has not done to blur what was just learned."""
+def end_widening(p: Record, s: Record, step: int) -> None:
+    """Widen the uncertainty of what was just learned, as far as an evaluation that is broken off before this step has not."""
     if s.windows == 0:
-        for k in range(max(step - _LEARN - 1, 0) if step > _LEARN else _BLURS, _BLURS):
-            _blur(p, s, k)
+        for k in range(max(step - _LEARN - 1, 0) if step > _LEARN else _WIDENINGS, _WIDENINGS):
+            _widen(p, s, k)
 
 
 @kernel
-def _blur(p: Record, s: Record, k: int) -> None:
+def _widen(p: Record, s: Record, k: int) -> None:
     """Let the errors of IMU `k` (0 to 6) be others at another pose, or with 7 those of all gyroscopes change alike."""
     if k < IMU_COUNT:
         for fault in range(READINGS * k, READINGS * (k + 1)):

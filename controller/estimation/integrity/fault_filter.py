@@ -58,7 +58,7 @@ _STEADY_FEEDBACK = 0.5
 _TIMING_S = 3e-4
 """How far the times of samples may be off, as IMUs have clocks of their own [s]."""
 
-_OF_RESTLESS = 0.15
+_OF_UNPLANNED_CHANGE = 0.15
 """A mean force is off by this share of the change of the acceleration from one window to the next, as far as that was not
 planned: the filter takes the acceleration to change evenly. For a platform that goes to and fro at 20 Hz this is twice the
 error, and at 35 Hz the error.
@@ -138,8 +138,8 @@ STATE = record_dtype(
     counted=(np.int64, IMU_COUNT),  # whether the IMU gave enough of them
     turning=np.float64,  # greatest angular acceleration of platform and legs that was planned for it [rad/s^2]
     rough=np.float64,  # standard deviation of a mean specific force by what is not known of the motion [m/s^2]
-    restless=(np.float64, 2),  # by `parity`: mean squares of how much the platform's acceleration that was not planned changes
-    # between windows, where its IMU is [m^2/s^4], and of the angular one [rad^2/s^4]
+    unplanned_change=(np.float64, 2),  # by `parity`: mean squares of how much the acceleration that was not planned changes
+    # between windows, where the platform's IMU is [m^2/s^4], and of the angular one [rad^2/s^4]
     weight=(np.float64, (IMU_COUNT, 2)),  # of the means, angular velocity and specific force
     information=(np.float64, (UNKNOWNS, UNKNOWNS)),
     vector=(np.float64, UNKNOWNS),
@@ -305,7 +305,7 @@ def _close_window(p: Record, s: Record, variance: Array, shaking: Record, legs: 
         s.counted[k] = _LEAST_SAMPLES * s.samples[k] >= s.collected or (s.samples[k] > 1 and even)
         if s.counted[k] == 0:
             continue
-        unknown = s.rough**2 + corrected**2 + _OF_RESTLESS**2 * s.restless[0]
+        unknown = s.rough**2 + corrected**2 + _OF_UNPLANNED_CHANGE**2 * s.unplanned_change[0]
         shaken = shaking.excess[ACCELEROMETER, k] + shaking.hidden[k] + shaking.mean[k]
         # What shakes an IMU beyond its noise makes its mean as uncertain.
         s.weight[k, 0] = s.samples[k] / (max(p.variance[0], variance[0, k]) + p.window * (_TIMING_S * turning) ** 2)
@@ -419,7 +419,7 @@ def _forget(p: Record, s: Record, information: Array, vector: Array) -> None:
         stiffness = p.stiffness[n // 3]
         if s.catching_up != 0:
             stiffness *= _CATCHING_UP_STIFFNESS
-        s.factor[n, n] += stiffness / (1.0 + stiffness * s.restless[n // 3] / (p.duration * p.duration))
+        s.factor[n, n] += stiffness / (1.0 + stiffness * s.unplanned_change[n // 3] / (p.duration * p.duration))
     _take_away(s, information, vector, p.keep ** (t / p.duration))
     if s.follows == 0 and s.jumped > _LEAST_JUMP:
         for first, per in ((6, 1.0), (12, p.duration)):

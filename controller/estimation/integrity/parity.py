@@ -61,7 +61,7 @@ _FORCE_LIMIT, _ROUGH_SIGMAS = 0.9, 3.0
 _ENOUGH = 5
 """So many gyroscopes know the change of the twist well enough for that."""
 
-_RESTLESS_S = 0.1
+_CHANGE_S = 0.1
 """Time constant over which the change of the acceleration that was not planned is averaged [s]."""
 
 _AVERAGED = 0.25
@@ -95,9 +95,9 @@ STATE = record_dtype(
     twist=(np.float64, _TWIST),  # of this one, beyond the planned one
     acceleration=(np.float64, _TWIST),  # its change since the window before, per second
     known_for=np.int64,  # in how many windows in direct succession it has been known well enough
-    uneven=(np.float64, 2),  # square of that acceleration's change between windows, averaged, less noise: linear, angular
-    jerked=(np.float64, _TWIST),  # from here on scratch: that change
-    changed=(np.float64, 2),  # its squares
+    mean_square=(np.float64, 2),  # of that acceleration's change between windows, less noise: linear, angular
+    change=(np.float64, _TWIST),  # from here on scratch: that change
+    squares=(np.float64, 2),  # its squares
     normal=(np.float64, (_WITH_BASE, _WITH_BASE)),
     covariance=(np.float64, (_WITH_BASE, _WITH_BASE)),  # of what is fitted, for gyroscopes of variance 1
     fit=(np.float64, _WITH_BASE),  # twist and base's rate
@@ -137,7 +137,7 @@ def step_parity(
     s.limit = least + _LATE_S * (f.turning + _unplanned_turning(s, f, duration))
     if s.error <= s.limit:
         _learn_usual(s, f, excluded, duration / _USUAL_S)
-    _average_restlessness(s, f, excluded, worst >= 0, duration, variance / samples)
+    _average_unplanned_change(s, f, excluded, worst >= 0, duration, variance / samples)
     _compare_forces(s, f, excluded, samples, duration, shaking)
     s.off_for = s.off_for + 1 if s.error > s.limit else 0
     if s.off_for < _WINDOWS:
@@ -153,6 +153,14 @@ def step_parity(
 @kernel
 def _counts(f: Record, excluded: Array, k: int) -> bool:
     return bool(f.counted[k] != 0 and excluded[k] == 0)
+
+
+@kernel
+def _count_used(f: Record, excluded: Array) -> int:
+    used = 0
+    for k in range(IMU_COUNT):
+        used += _counts(f, excluded, k)
+    return used
 
 
 @kernel
@@ -244,40 +252,37 @@ def _unplanned_turning(s: Record, f: Record, duration: float) -> float:
 
 
 @kernel
-def _average_restlessness(s: Record, f: Record, excluded: Array, fits: bool, duration: float, variance: float) -> None:
+def _average_unplanned_change(s: Record, f: Record, excluded: Array, fits: bool, duration: float, variance: float) -> None:
     """Average how much the acceleration that was not planned changes from window to window, where windows follow each other.
 
     It does not count where too few gyroscopes know it. What their noise adds on average, of this variance in a window's mean
     [rad^2/s^2], is taken off.
     """
-    used = 0
-    for k in range(IMU_COUNT):
-        used += _counts(f, excluded, k)
-    if fits and used >= _ENOUGH:
+    if fits and _count_used(f, excluded) >= _ENOUGH:
         s.known_for = s.known_for + 1 if f.follows != 0 else 1
     else:
         s.known_for = 0
     # The change of a difference counts the middle one of three means twice.
     noise = 6.0 * variance / duration**2
-    s.changed[:] = 0.0
+    s.squares[:] = 0.0
     for i in range(_TWIST):
         acceleration = (s.twist[i] - s.twist_before[i]) / duration
-        s.jerked[i] = acceleration - s.acceleration[i]
+        s.change[i] = acceleration - s.acceleration[i]
         s.acceleration[i] = acceleration
         if i >= 3:
-            s.changed[1] += s.jerked[i] ** 2 - noise * s.covariance[i, i]
+            s.squares[1] += s.change[i] ** 2 - noise * s.covariance[i, i]
     for m in range(3):
         row = f.jacobian[PLATFORM_IMU, 3 + m, _FIRST + _TWIST :]
-        change = 0.0
+        along = 0.0
         for i in range(_TWIST):
-            change += row[i] * s.jerked[i]
+            along += row[i] * s.change[i]
             for j in range(_TWIST):
-                s.changed[0] -= noise * row[i] * s.covariance[i, j] * row[j]
-        s.changed[0] += change * change
-    if s.known_for > 2 and np.isfinite(s.changed[0] + s.changed[1]):
+                s.squares[0] -= noise * row[i] * s.covariance[i, j] * row[j]
+        s.squares[0] += along * along
+    if s.known_for > 2 and np.isfinite(s.squares[0] + s.squares[1]):
         for i in range(2):
-            s.uneven[i] += min(1.0, duration / _RESTLESS_S) * (s.changed[i] - s.uneven[i])
-            f.restless[i] = max(s.uneven[i], 0.0)
+            s.mean_square[i] += min(1.0, duration / _CHANGE_S) * (s.squares[i] - s.mean_square[i])
+            f.unplanned_change[i] = max(s.mean_square[i], 0.0)
 
 
 @kernel
@@ -292,10 +297,8 @@ def _learn_usual(s: Record, f: Record, excluded: Array, share: float) -> None:
 @kernel
 def _compare_forces(s: Record, f: Record, excluded: Array, samples: int, duration: float, shaking: Record) -> None:
     """Find what the forces of this window and the last one show beyond the change of the twist between them."""
-    follows, used, lasting, no_motion = f.follows != 0, 0, 0, shaking.no_motion
+    follows, used, lasting, no_motion = f.follows != 0, _count_used(f, excluded), 0, shaking.no_motion
     after_gap = f.windows > 1 and not follows
-    for k in range(IMU_COUNT):
-        used += _counts(f, excluded, k)
     rough = _ROUGH_SIGMAS * f.rough
     s.steady = s.second = most = 0.0
     s.common = np.inf

@@ -100,8 +100,8 @@ def test_it_forgets():
 @pytest.mark.parametrize("jumped", [0.0, 1e-12, 2e-4, 0.01])
 @pytest.mark.parametrize("catching_up", [False, True])
 @pytest.mark.parametrize("follows", [False, True])
-@pytest.mark.parametrize("restless", [(0.0, 0.0), (4.0, 25.0)])
-def test_what_jerk_and_jumps_take_away_is_what_they_add_to_the_covariance(restless, follows, catching_up, jumped):
+@pytest.mark.parametrize("unplanned_change", [(0.0, 0.0), (4.0, 25.0)])
+def test_what_jerk_and_jumps_take_away_is_what_they_add_to_the_covariance(unplanned_change, follows, catching_up, jumped):
     """Y^-1 becomes (Y^-1 + G Q G^T) / keep, and after a gap the variances of jumps are added to it."""
     mechanism, _ = readings("static", 0.1)
     parameters, state = constants(mechanism)
@@ -115,12 +115,12 @@ def test_what_jerk_and_jumps_take_away_is_what_they_add_to_the_covariance(restle
     f["information"] = np.linalg.inv(covariance)
     f["vector"] = f["information"] @ estimate
     f["between"], f["follows"], f["catching_up"], f["jumped"] = 0.02, follows, catching_up, jumped
-    f["restless"] = restless
+    f["unplanned_change"] = unplanned_change
     _forget(p, f, f["information"], f["vector"])
     t, eye = 0.02, np.eye(6)
     by_jerk = np.vstack([t**3 / 6.0 * eye, 0.5 * t**2 * eye, t * eye, np.zeros((FAULTS, 6))])
     stiffness = np.repeat(p["stiffness"], 3) * (_CATCHING_UP_STIFFNESS if catching_up else 1.0)
-    jerk = 1.0 / stiffness + np.repeat(restless, 3) / p["duration"] ** 2
+    jerk = 1.0 / stiffness + np.repeat(unplanned_change, 3) / p["duration"] ** 2
     expected = (covariance + by_jerk * jerk @ by_jerk.T) * np.exp(t / MEMORY_S)
     if jumped > 1e-9 and not follows:
         jumps = np.repeat(np.array(_JUMPS) * jumped, 3)
@@ -134,10 +134,10 @@ def test_what_jerk_and_jumps_take_away_is_what_they_add_to_the_covariance(restle
 
 def test_a_mean_force_counts_less_where_the_acceleration_is_not_steady():
     weights = []
-    for restless in (0.0, 4.0):
+    for unplanned_change in (0.0, 4.0):
         mechanism, r = readings("static", 0.1)
         parameters, state = constants(mechanism)
-        state["integrity"]["filter"]["restless"][0] = restless
+        state["integrity"]["filter"]["unplanned_change"][0] = unplanned_change
         filtered(mechanism, r, parameters, state)
         weights.append(state["integrity"]["filter"]["weight"].copy())
     (calm, uneasy), window = weights, 5

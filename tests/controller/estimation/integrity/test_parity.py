@@ -224,7 +224,7 @@ def test_the_change_of_the_gyroscopes_twist_is_the_acceleration_that_was_not_pla
     mechanism, r = readings("mixed", 1.0, 3)
     r.samples[:, 1, 2] += [0.4, -0.2, 0.3]
     parameters, state = constants(mechanism)
-    f, found, uneven, variance = state["integrity"]["filter"], [], np.zeros(2), 1e-6
+    f, found, mean_square, variance = state["integrity"]["filter"], [], np.zeros(2), 1e-6
     for n in range(6):
         part = type(r)(*(each[5 * n + (n > 0) : 5 * n + 6] for each in vars(r).values()))
         filtered(mechanism, part, parameters, state)
@@ -240,15 +240,15 @@ def test_the_change_of_the_gyroscopes_twist_is_the_acceleration_that_was_not_pla
             np.testing.assert_allclose(state["integrity"]["parity"]["off_motion"], np.linalg.norm(beyond, axis=1), rtol=1e-5)
         if n > 1:
             first, second, third = (twist for twist, *_ in found[-3:])
-            jerked = (third - 2.0 * second + first) * RATE_HZ / 5
+            change = (third - 2.0 * second + first) * RATE_HZ / 5
             rows = j[:, :3, 6:12].reshape(-1, 6)
             noise = 6.0 * variance / 5 * (RATE_HZ / 5) ** 2 * np.linalg.inv(rows.T @ rows)
             force = j[6, 3:, 12:]
-            squares = [np.square(force @ jerked).sum(), np.square(jerked[3:]).sum()]
+            squares = [np.square(force @ change).sum(), np.square(change[3:]).sum()]
             squares = np.array(squares) - [np.trace(force @ noise @ force.T), np.trace(noise[3:, 3:])]
-            uneven += 0.1 * (squares - uneven)
-        np.testing.assert_allclose(state["integrity"]["parity"]["uneven"], uneven, rtol=1e-5)
-        np.testing.assert_allclose(f["restless"], np.maximum(uneven, 0.0), rtol=1e-5)
+            mean_square += 0.1 * (squares - mean_square)
+        np.testing.assert_allclose(state["integrity"]["parity"]["mean_square"], mean_square, rtol=1e-5)
+        np.testing.assert_allclose(f["unplanned_change"], np.maximum(mean_square, 0.0), rtol=1e-5)
 
 
 def test_what_is_left_out_shows_no_force():
