@@ -81,9 +81,10 @@ the excess. The misfit is averaged with the time constant [s]. Sound IMUs have l
 weights stand for are alike in all measurements, or move the pose.
 """
 
-_SOUND, _MOST, _SHAKEN = 0.2, 1.0, 0.3
-"""Mean forces that are no motion count beyond what sound IMUs hardly ever exceed, and up to this much [m/s^2]; the share of the
-vibration's RMS that counts with them.
+_SOUND, _MOST, _SHAKEN, _SHAKEN_S = 0.2, 1.0, 0.3, 0.5
+"""Mean forces that are no motion count beyond what sound IMUs hardly ever exceed, and up to this much [m/s^2]; the share of
+vibration that counts with them, and the time constant of its average [s]. A shock is over before it has moved the pose far, as
+when brakes are released and the mechanism has play.
 """
 
 _BY_FORCE = 0.04, 0.06
@@ -103,7 +104,7 @@ _USUALLY_DRIFTED, _OF_DRIFTED = (0.3, 0.7), (3.0, 2.5)
 
 _WELL_SHOWN, _OF_TURN = 5e-4, 5.0
 """The standard deviation of the rotation by the legs counts beyond the first [rad], so many times. On 6-4-II at 250 Hz
-it is some 3 mrad, and a slow turn of the platform's IMU turns the pose by up to 0.9 deg before it is told.
+it is some 3 mrad, and a slow turn of the platform's IMU turns the pose by up to 0.7 deg before it is told.
 """
 
 STATE = record_dtype(
@@ -112,6 +113,7 @@ STATE = record_dtype(
     spread=(np.float64, 2),  # the square of its second, when the filters have settled
     closed=(np.float64, 2),  # square of the closed form's standard deviation then
     misfit=np.float64,  # of the closed form, averaged
+    shaken=np.float64,  # root of the greatest excess of an accelerometer, averaged [m/s^2]
     fault=(np.float64, 2),  # the greatest effect of a fault, of the last complete evaluation of recent readings
     next_fault=(np.float64, 2),  # of the one under way
     determined=np.int64,  # whether the readings determine the pose
@@ -235,7 +237,7 @@ def publish_level(
         misfit: of the closed form now, `pose_estimator.STATE`.
         duration: since the last cycle [s].
         steady: greatest mean force that is no motion [m/s^2], `parity.STATE`.
-        shaken: greatest mean square of vibration [m^2/s^4], `shaking.STATE`.
+        shaken: greatest excess of an accelerometer now [m^2/s^4], `shaking.STATE`.
         bent: (2,), by how much an encoder could move position [m] and rotation [rad] unseen.
         moved: (2,), by how much they have moved otherwise than commanded, `commanded.STATE`.
         crept: (2,), by how much they may have crept at rest, `rest.STATE`.
@@ -244,7 +246,8 @@ def publish_level(
     """
     s.misfit += min(1.0, duration / _MISFIT_S) * (misfit - s.misfit)
     beyond = _OF_MISFIT**2 * max(s.misfit - _USUAL_MISFIT, 0.0)
-    force = min(max(steady - _SOUND, 0.0) + _SHAKEN * np.sqrt(shaken), _MOST)
+    s.shaken += min(1.0, duration / _SHAKEN_S) * (np.sqrt(shaken) - s.shaken)
+    force = min(max(steady - _SOUND, 0.0) + _SHAKEN * s.shaken, _MOST)
     unsettled = max(0.0, 1.0 - settled / _SETTLED_S)
     for part in range(2):
         squared = s.evaluated[part] + s.spread[part] * (1.0 + _UNSETTLED[part] * unsettled) ** 2

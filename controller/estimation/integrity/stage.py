@@ -29,6 +29,7 @@ from controller.rig import elapsed
 from controller.settings import FusionSettings
 from plant.compiled import MOST, Limits, Record, filled, kernel, record_dtype, shared_kernel
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
+from plant.imu import ACCELEROMETER
 from plant.pose import Array
 
 PARAMETERS = record_dtype(
@@ -215,7 +216,7 @@ def publish_level(p: Record, s: Record, rig: Record, time: Record, imus: Record,
     if s.evaluations > 0:
         protection.publish_level(
             s.protection, s.filter.windows * p.filter.duration, pose.misfit, elapsed(rig, time), s.parity.steady,
-            imus.shaking.mean.max(), pose.bent, s.commanded.moved, s.rest.crept, pose.apart, s.gravity.drifted,
+            imus.shaking.excess[ACCELEROMETER].max(), pose.bent, s.commanded.moved, s.rest.crept, pose.apart, s.gravity.drifted,
         )  # fmt: skip
 
 

@@ -19,8 +19,8 @@ def ended(
     level, age=50.0, of_learned=0, steady=0.0, shaken=0.0, own=OWN, misfit=0.0, bent=NOT, moved=NOT, crept=NOT, apart=NOT,
     drifted=NOT, settled=50.0, by_legs=0.0,
 ):  # fmt: skip
-    """The level (2,) at the end of an evaluation, with a misfit that lasts."""
-    level["covariance"], level["misfit"] = own, misfit
+    """The level (2,) at the end of an evaluation, with a misfit and a vibration that last."""
+    level["covariance"], level["misfit"], level["shaken"] = own, misfit, np.sqrt(shaken)
     evidence = np.zeros((), STATE)
     evidence["of_learned"] = of_learned
     end_level(level[()], evidence[()], age, by_legs)
@@ -149,6 +149,10 @@ def test_forces_that_are_no_motion_raise_the_level_between_evaluations():
     np.testing.assert_allclose(ended(level, shaken=4.0), np.hypot(sound, [0.024, 0.036]))
     np.testing.assert_allclose(ended(level, steady=5.0, shaken=9.0), np.hypot(sound, [0.04, 0.06]))
     np.testing.assert_allclose(ended(level, bent=(2e-4, 3e-3)), np.hypot(sound, [2e-4, 3e-3]))
+    # A shock moves the pose little: after 0.01 s, it counts by its share of the average.
+    level["shaken"] = 0.0
+    publish_level(level[()], 50.0, 0.0, 0.01, 0.0, 400.0, *np.zeros((5, 2)))
+    np.testing.assert_allclose(level["level"], np.hypot(sound, [0.0048, 0.0072]))
 
 
 def test_what_was_not_commanded_and_two_estimates_that_are_apart_raise_the_level():
