@@ -115,7 +115,8 @@ _TAKE = _APART + 1 + POSE
 _LEARN = _TAKE + 1
 STEPS = _LEARN + 1 + _WIDENINGS
 """Steps of an evaluation: copying the last half second, eliminating the rest of its motion, putting the system together,
-eliminating the errors learned and what is left out, keeping what ties the pose to faults, eliminating the pose, and learning.
+eliminating the errors learned and what is left out, keeping what ties the pose to faults, eliminating the pose, learning, and
+widening the uncertainty of what was learned.
 """
 
 

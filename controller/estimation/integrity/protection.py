@@ -81,10 +81,10 @@ the excess. The misfit is averaged with the time constant [s]. Sound IMUs have l
 weights stand for are alike in all measurements, or move the pose.
 """
 
-_SOUND, _MOST, _SHAKEN, _SHAKEN_S = 0.2, 1.0, 0.3, 0.5
+_SOUND, _MOST, _SHAKEN, _SHAKEN_S, _HARDEST = 0.2, 1.0, 0.3, 0.5, 160.0
 """Mean forces that are no motion count beyond what sound IMUs hardly ever exceed, and up to this much [m/s^2]; the share of
-vibration that counts with them, and the time constant of its average [s]. A shock is over before it has moved the pose far, as
-when brakes are released and the mechanism has play.
+vibration that counts with them, the time constant of its average [s], and the most that counts in it [m/s^2]. A shock is over
+before it has moved the pose far, as when brakes are released and the mechanism has play.
 """
 
 _BY_FORCE = 0.04, 0.06
@@ -226,7 +226,7 @@ def end_level(s: Record, e: Record, age: float, by_legs: float) -> None:
 
 @kernel
 def publish_level(
-    s: Record, settled: float, misfit: float, duration: float, steady: float, shaken: float, bent: Array, moved: Array,
+    s: Record, settled: float, misfit: float, duration: float, steady: float, excess: float, bent: Array, moved: Array,
     crept: Array, apart: Array, drifted: Array,
 ) -> None:  # fmt: skip
     """Publish the level of a cycle, with what has come up since the last evaluation.
@@ -237,7 +237,7 @@ def publish_level(
         misfit: of the closed form now, `pose_estimator.STATE`.
         duration: since the last cycle [s].
         steady: greatest mean force that is no motion [m/s^2], `parity.STATE`.
-        shaken: greatest excess of an accelerometer now [m^2/s^4], `shaking.STATE`.
+        excess: the greatest of an accelerometer's square over what is explained now [m^2/s^4], `shaking.STATE`.
         bent: (2,), by how much an encoder could move position [m] and rotation [rad] unseen.
         moved: (2,), by how much they have moved otherwise than commanded, `commanded.STATE`.
         crept: (2,), by how much they may have crept at rest, `rest.STATE`.
@@ -246,7 +246,8 @@ def publish_level(
     """
     s.misfit += min(1.0, duration / _MISFIT_S) * (misfit - s.misfit)
     beyond = _OF_MISFIT**2 * max(s.misfit - _USUAL_MISFIT, 0.0)
-    s.shaken += min(1.0, duration / _SHAKEN_S) * (np.sqrt(shaken) - s.shaken)
+    if np.isfinite(excess):
+        s.shaken += min(1.0, duration / _SHAKEN_S) * (min(np.sqrt(excess), _HARDEST) - s.shaken)
     force = min(max(steady - _SOUND, 0.0) + _SHAKEN * s.shaken, _MOST)
     unsettled = max(0.0, 1.0 - settled / _SETTLED_S)
     for part in range(2):

@@ -153,6 +153,9 @@ def test_forces_that_are_no_motion_raise_the_level_between_evaluations():
     level["shaken"] = 0.0
     publish_level(level[()], 50.0, 0.0, 0.01, 0.0, 400.0, *np.zeros((5, 2)))
     np.testing.assert_allclose(level["level"], np.hypot(sound, [0.0048, 0.0072]))
+    for excess, shaken in ((np.inf, 0.4), (1e12, 0.98 * 0.4 + 3.2), (0.0, 0.98 * (0.98 * 0.4 + 3.2))):
+        publish_level(level[()], 50.0, 0.0, 0.01, 0.0, excess, *np.zeros((5, 2)))
+        assert level["shaken"] == pytest.approx(shaken)
 
 
 def test_what_was_not_commanded_and_two_estimates_that_are_apart_raise_the_level():
