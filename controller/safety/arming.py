@@ -6,7 +6,6 @@ from controller.estimation.imu_monitor import contradiction
 from controller.planning.segments import APPROACH_SEGMENTS, approach_duration, plan_approach
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
 from controller.safety.stop import handle_cause
-from controller.safety.watch import least_evidence
 from controller.settings import SafetySettings
 from plant.compiled import Record, filled, kernel, record_dtype
 from plant.dynamics.variables import IMU_COUNT, PLATFORM_IMU
@@ -213,12 +212,11 @@ def _find_obstacle(
         return Cause.BUS_LOST.value, -1, _unanswered_for(s.watch), 0.0
     lost, lengths, error = 0, pose.lengths, pid.error
     # The two take turns: a fault that is there from the start shows in the first alone, until it has been learned.
-    for kind in range(2):
-        blamed, found = s.arming.blamed[kind], s.arming.evidence[kind]
-        least = least_evidence(p.watch, blamed, kind == 0, integrity.evaluations)
-        if found > least:
-            cause = Cause.NO_TRUST.value if blamed < 0 else Cause.NO_SENSORS.value
-            return cause, blamed, np.sqrt(found), np.sqrt(least)
+    most = 0 if s.arming.evidence[0] > s.arming.evidence[1] else 1
+    if s.arming.evidence[most] > p.watch.evidence:
+        blamed = s.arming.blamed[most]
+        cause = Cause.NO_TRUST.value if blamed < 0 else Cause.NO_SENSORS.value
+        return cause, blamed, np.sqrt(s.arming.evidence[most]), np.sqrt(p.watch.evidence)
     lasting = s.watch.lasting
     if lasting[1] > 0.0:
         blamed = s.watch.lasting_imu

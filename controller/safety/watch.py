@@ -469,7 +469,7 @@ def judge_evidence(
         return back
     k = e.blamed
     ends = k < 0 or _is_needed(p.watch, k)
-    least = least_evidence(p.watch, k, judged, e.evaluations)
+    least = _ENDING * limit if ends and judged and e.evaluations >= _FIRST_COUNTED else limit
     seen, most = e.best_evidence >= least, np.sqrt(least)
     if seen and k < 0:
         cause = Cause.GYROSCOPES_SHARE + e.shared
@@ -494,20 +494,6 @@ def judge_evidence(
         handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, w.lasting_imu, found, most)
         _report_rival(s, e, w.lasting_imu)
     return False
-
-
-@kernel
-def least_evidence(p: Record, k: int, recent: bool, evaluations: int) -> float:
-    """The evidence beyond which a run ends, or an IMU is left out [sigma^2].
-
-    Args:
-        p: dtype `PARAMETERS`.
-        k: the IMU that the evidence blames; -1 if all share the error.
-        recent: whether the evidence is of recent readings.
-        evaluations: how many there have been.
-    """
-    ends = k < 0 or _is_needed(p, k)
-    return float(_ENDING * p.evidence if ends and recent and evaluations >= _FIRST_COUNTED else p.evidence)
 
 
 @kernel

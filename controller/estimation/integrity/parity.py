@@ -8,8 +8,8 @@ gyroscope is off, however much the fit follows it. A gyroscope is named if the r
 which gives J three more columns, explains them about as well. What a gyroscope has been off for many seconds is no large error:
 it is left to the evidence.
 
-Where t changes unevenly, the acceleration that was not planned is not steady: the loop may chatter in the mechanism's play. The
-fault filter then expects more jerk, and relies less on mean forces.
+Where the change of t differs from window to window, the acceleration that was not planned is not steady: the loop may chatter
+in the mechanism's play. The fault filter then expects more jerk, and relies less on mean forces.
 
 From one window to the next, t changes with the acceleration that was not planned, averaged with weights that rise in the first
 window and fall in the second one. If the forces, averaged alike, show more than that, it is no motion: it is vibration, or

@@ -268,23 +268,6 @@ def test_evidence_of_either_kind_prevents_arming(hexapod, kind, blamed):
             assert obstacle(bench) == (cause, blamed, pytest.approx(np.sqrt(size * limit)), np.sqrt(limit))
 
 
-@pytest.mark.parametrize(("blamed", "share"), [(-1, 0.5), (6, 0.5), (3, 1.0)])
-def test_what_would_end_a_run_at_half_of_the_limit_prevents_arming_there(hexapod, blamed, share):
-    """Evidence that all IMUs share an error, or that the platform's has one, after the first two seconds."""
-    bench = Bench(hexapod)
-    bench.steps(bench.hold - 1)
-    least = share * float(bench.parameters["safety"]["watch"]["evidence"])
-    arming = bench.state["safety"]["arming"]
-    bench.state["integrity"]["evaluations"] = 20
-    for size, armed in ((1.01, False), (0.99, True)):
-        arming["evidence"][0], arming["blamed"][0] = size * least, blamed
-        bench.steps(2)
-        assert (bench.mode == Mode.RUNNING) == armed
-        if not armed:
-            cause = Cause.NO_TRUST if blamed < 0 else Cause.NO_SENSORS
-            assert obstacle(bench) == (cause, blamed, pytest.approx(np.sqrt(size * least)), pytest.approx(np.sqrt(least)))
-
-
 @pytest.mark.parametrize(("factor", "armed"), [(1.01, True), (0.99, False)])
 def test_an_estimate_that_drifts_on_the_brakes_is_not_armed(hexapod, factor, armed):
     """A platform that sinks; the limit is around what the means of the lengths over 50 ms change by, from one to the next."""
