@@ -51,7 +51,7 @@ _ENDING = 0.5
 error, or it is of one that is needed. Leaving out an IMU takes more.
 """
 
-_USUAL, _CONTRADICTED, _OF_BEST = 0.3, 0.6, 0.5
+_USUAL, _CONTRADICTED, _OF_BEST = 0.375, 0.75, 0.5
 """A cumulative sum (E. S. Page, Biometrika 41, 1954) takes the evidence against the platform's IMU, in sigma. Each evaluation
 adds what it has beyond the first share of the limit (in sigma, too), or takes off what it lacks. From the second share on, the
 sum ends the run. Evidence of less than the last share of the most evidence (both are squares of sigma) counts as none.

@@ -104,7 +104,7 @@ _USUALLY_DRIFTED, _OF_DRIFTED = (0.3, 0.7), (3.0, 2.5)
 
 _WELL_SHOWN, _OF_TURN = 5e-4, 5.0
 """The standard deviation of the rotation by the legs counts beyond the first [rad], so many times. On 6-4-II at 250 Hz
-it is some 3 mrad, and a slow turn of the platform's IMU turns the pose by up to 0.8 deg before it is told.
+it is some 3 mrad, and a slow turn of the platform's IMU turns the pose by up to 0.9 deg before it is told.
 """
 
 STATE = record_dtype(

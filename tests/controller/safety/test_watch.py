@@ -708,13 +708,12 @@ def test_unexplained_evidence_must_come_in_evaluations_in_a_row_of_recent_readin
 
 @pytest.mark.parametrize(
     ("imu", "needed", "evidence", "platform", "expected"),
-    [(6, 1, 4.3, 0.0, 3), (6, 1, 5.1, 0.0, 2), (6, 1, 2.3, 0.0, None), (6, 0, 4.3, 0.0, None), (3, 1, 5.5, 4.1, 3),
-     (3, 1, 6.0, 4.1, None), (-1, 1, 5.5, 4.1, 3)],
+    [(6, 1, 4.3, 0.0, 5), (6, 1, 5.5, 0.0, 3), (6, 1, 2.9, 0.0, None), (6, 0, 4.3, 0.0, None), (3, 1, 5.5, 4.1, 6),
+     (3, 1, 6.0, 4.1, None), (-1, 1, 5.5, 4.1, 6)],
 )  # fmt: skip
 def test_evidence_that_adds_up_against_the_platforms_imu_ends_a_motion(imu, needed, evidence, platform, expected):
-    """What is beyond 2.4 of 8 sigma, up to 4.8. The run may go on without that IMU only if the settings allow it.
-
-    Evidence that is less than half of the most (as a square) does not count.
+    """What is beyond 3 of 8 sigma, up to 6. The run may go on without that IMU only if the settings allow it. Evidence that is
+    less than half of the most (as a square) does not count.
     """
     _, parameters, state = moving()
     if not needed:
@@ -726,13 +725,13 @@ def test_evidence_that_adds_up_against_the_platforms_imu_ends_a_motion(imu, need
     state["integrity"]["evaluations"] = 20
     assert evaluations_until_a_stop(parameters, state) == expected
     if expected:
-        added = expected * ((platform or evidence) - 2.4)
-        assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(added), pytest.approx(4.8))
+        added = expected * ((platform or evidence) - 3.0)
+        assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(added), pytest.approx(6.0))
         rival = [] if imu == 6 else [Cause.RIVAL_IMU if imu == 3 else Cause.RIVAL_GYROSCOPES]
         assert told(state) == [Cause.IMUS_CONTRADICT, *rival]
 
 
-@pytest.mark.parametrize(("between", "expected"), [(0.1, None), (1.0, 8), (None, 4)])
+@pytest.mark.parametrize(("between", "expected"), [(1.0, None), (2.0, 16), (None, 6)])
 def test_less_evidence_against_the_platforms_imu_takes_off_from_the_sum(between, expected):
     """Evaluations with 4.6 and less sigma take turns; what was learned does not count."""
     _, parameters, state = moving()
@@ -756,26 +755,26 @@ def test_a_sum_that_ends_a_motion_does_so_beside_more_evidence_that_names_no_imu
     state["integrity"]["evaluations"] = 20
     weigh(state, 2, 8.5, 9.0, rival=8.4, platform=6.2)
     assert evaluations_until_a_stop(parameters, state) == 2
-    assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(7.6), pytest.approx(4.8))
+    assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(6.4), pytest.approx(6.0))
     assert rival_of(state) == (2, pytest.approx(8.5))
     assert told(state) == [Cause.IMUS_CONTRADICT, Cause.RIVAL_IMU]
 
 
 def test_a_sum_that_grew_on_the_brakes_delays_arming_by_a_limited_time():
-    """It is kept below twice its limit, and 1.9 sigma take off 0.5 each time."""
+    """It is kept below twice its limit, and 2 sigma take off 1 each time."""
     _, parameters, state = moving(mode=Mode.IDLE)
     watch = state["safety"]["watch"]
     state["integrity"]["evaluations"] = 20
     weigh(state, 3, 9.0, 9.0, platform=8.0)
     for _ in range(100):
         assert not judge(parameters, state)
-    assert watch["lasting"][1] == pytest.approx(4.8**2) and watch["lasting_imu"] == 6 and told(state) == []
-    weigh(state, 6, 1.9, 2.0)
+    assert watch["lasting"][1] == pytest.approx(36.0) and watch["lasting_imu"] == 6 and told(state) == []
+    weigh(state, 6, 2.0, 2.0)
     lasted = 0
     while watch["lasting"][1] > 0.0:
         judge(parameters, state)
         lasted += 1
-    assert lasted == 10
+    assert lasted == 7
 
 
 @pytest.mark.parametrize(
@@ -810,7 +809,7 @@ def test_evidence_about_another_set_of_imus_does_not_last(change):
     _, parameters, state = moving()
     p, s, integrity = parameters, state, state["integrity"]
     state["imus"]["healthy"], integrity["evaluations"] = 1, 30
-    weigh(state, 6, 3.9, 7.0)
+    weigh(state, 6, 4.9, 7.0)
     assert evaluations_until_a_stop(parameters, state, 4) is None
     if change == "back":
         state["imus"]["excluded"][3] = 1
@@ -830,11 +829,11 @@ def test_evidence_about_another_set_of_imus_does_not_last(change):
 
 @pytest.mark.parametrize(
     ("suspected", "evidence", "needed", "calm", "left_out"),
-    [(3, 3.5, 1, 0, False), (2, 3.5, 1, 0, True), (3, 3.3, 1, 0, True), (3, 3.5, 0, 0, True), (4, 3.5, 1, 18, False),
-     (4, 3.5, 1, 19, True)],
+    [(3, 4.1, 1, 0, False), (2, 4.1, 1, 0, True), (3, 3.9, 1, 0, True), (3, 4.1, 0, 0, True), (5, 4.1, 1, 18, False),
+     (5, 4.1, 1, 19, True)],
 )  # fmt: skip
 def test_no_imu_is_left_out_while_the_platforms_imu_is_suspected(suspected, evidence, needed, calm, left_out):
-    """A sum of 3 sigma beyond 2.4 makes it suspected, and for 19 evaluations more, if the run needs it."""
+    """A sum of 3 sigma beyond 3 makes it suspected, and for 19 evaluations more, if the run needs it."""
     _, parameters, state = moving()
     state["imus"]["healthy"], state["integrity"]["evaluations"] = 1, 30
     if not needed:
@@ -858,7 +857,7 @@ def test_the_platforms_imu_is_suspected_if_a_legs_is_not_twice_as_likely(of_leg,
     _, parameters, state = moving()
     state["imus"]["healthy"], state["integrity"]["evaluations"] = 1, 30
     weigh(state, 2, of_leg, 7.5, platform=4.5)
-    assert evaluations_until_a_stop(parameters, state, 3) is None
+    assert evaluations_until_a_stop(parameters, state, 4) is None
     weigh(state, 2, 9.0, 9.5)
     assert judge(parameters, state) == left_out
 
@@ -867,7 +866,7 @@ def test_the_platforms_imu_stays_suspected_when_another_one_is_taken_back():
     _, parameters, state = moving()
     integrity, evidence = state["integrity"], state["integrity"]["evidence"]
     state["imus"]["healthy"], integrity["evaluations"], state["imus"]["excluded"][3] = 1, 30, 1
-    weigh(state, 6, 3.5, 5.0)
+    weigh(state, 6, 4.1, 5.0)
     assert evaluations_until_a_stop(parameters, state, 4) is None
     state["safety"]["watch"]["cleared_for"][3] = 5
     evidence["apart"], evidence["order"][0], evidence["apart_evidence"][0] = 1, 3, 0.0
