@@ -44,8 +44,7 @@ def test_every_figure_is_there(objectives, tmp_path, recwarn):
     path.parent.mkdir()
     comparison = Comparison("a", {"run.target": "circle"}, 2.0, 1.0, 3, 4)
     write_report(result, result.knee, [comparison], path)
-    # What other tests have left open may be found meanwhile.
-    assert [str(each.message) for each in recwarn if each.category is not ResourceWarning] == []
+    assert [str(each.message) for each in recwarn] == []
     page = path.read_text()
     assert figures_in(page) == ["front", "trials", "history", *(f"importance{n}" for n in range(len(objectives)))]
     assert "3 of 4" in page and "least -3.0" in page
