@@ -49,6 +49,7 @@ STATE = record_dtype(
     approach_cycles=np.int64,  # how long that takes
     evidence=(np.float64, 2),  # for a fault, of the last evaluation of recent readings, and of the last one of what was learned
     blamed=(np.int64, 2),  # the IMU that it is against; -1 if it is against all
+    most_evidence=(np.float64, 2),  # beyond what it would end a motion
 )
 """How arming goes."""
 
@@ -103,6 +104,7 @@ def run_arming_checks(
     if integrity.fresh != 0:
         kind = integrity.evidence.of_learned
         a.evidence[kind], a.blamed[kind] = integrity.best_evidence, integrity.blamed
+        a.most_evidence[kind] = s.watch.least_evidence
     if time.cycle < rig.hold_cycles or s.mode > Mode.ARMED:
         return
     if s.mode == Mode.IDLE:
@@ -210,13 +212,12 @@ def _find_obstacle(
     # Without answers, nothing below is about the present.
     if s.watch.unanswered > 0:
         return Cause.BUS_LOST.value, -1, _unanswered_for(s.watch), 0.0
-    lost, lengths, error = 0, pose.lengths, pid.error
+    lost, lengths, error, a = 0, pose.lengths, pid.error, s.arming
     # The two take turns: a fault that is there from the start shows in the first alone, until it has been learned.
-    most = 0 if s.arming.evidence[0] > s.arming.evidence[1] else 1
-    if s.arming.evidence[most] > p.watch.evidence:
-        blamed = s.arming.blamed[most]
-        cause = Cause.NO_TRUST.value if blamed < 0 else Cause.NO_SENSORS.value
-        return cause, blamed, np.sqrt(s.arming.evidence[most]), np.sqrt(p.watch.evidence)
+    for kind in range(2):
+        if a.evidence[kind] > a.most_evidence[kind]:
+            cause = Cause.NO_TRUST.value if a.blamed[kind] < 0 else Cause.NO_SENSORS.value
+            return cause, a.blamed[kind], np.sqrt(a.evidence[kind]), np.sqrt(a.most_evidence[kind])
     lasting = s.watch.lasting
     if lasting[1] > 0.0:
         blamed = s.watch.lasting_imu
@@ -237,7 +238,7 @@ def _find_obstacle(
         if out and k == PLATFORM_IMU and p.watch.without_platform_imu < np.inf:
             return Cause.PLATFORM_IMU_LOST.value, k, np.nan, np.nan
     for k in range(rig.legs):
-        drift = s.arming.drift[k] if s.arming.windows > 1 else np.inf
+        drift = a.drift[k] if a.windows > 1 else np.inf
         if s.mode == Mode.IDLE and not drift <= p.arming.drift:
             return Cause.NOT_STILL.value, k, drift, p.arming.drift
     for k in range(rig.legs):

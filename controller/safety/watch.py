@@ -32,26 +32,22 @@ _MOST_DOUBLINGS = 20
 _CLEARLY, _CLEARLY_OF_ALL = 0.5, 0.25
 """How much less than for the named IMU the evidence for anything else must be: of the limit, and of that evidence."""
 
-_REST, _REST_OF_ALL = 1.0, 0.35
-"""How much evidence for further faults may be left without the named IMU: times the limit, and of the evidence for it.
-
+_REST, _REST_OF_ALL, _UNEXPLAINED_EVALUATIONS = 1.0, 0.35, 3
+"""How much evidence for further faults may be left without the named IMU: so many times the limit, and of the evidence for it.
 A fault that has just come up is not constant over the memory of the fault filter, and leaves up to a third of its own evidence.
+
+If more is left in so many evaluations in a row, more than one IMU is wrong, though none of them may be beyond the limit.
 """
 
 _PATIENT = 1.5
 """How many times the limit evidence may reach while more of it may tell what is wrong."""
-
-_UNEXPLAINED, _UNEXPLAINED_EVALUATIONS = 1.25, 3
-"""Nor may more be left than the sum of so many times the limit and the share above, in so many evaluations in a row: then more
-than one IMU is wrong, though none of them may be beyond the limit.
-"""
 
 _ENDING = 0.5
 """Beyond this share of the limit, evidence of recent readings ends a run where no IMU could be left out: all IMUs share the
 error, or it is of one that is needed. Leaving out an IMU takes more.
 """
 
-_USUAL, _CONTRADICTED, _OF_BEST = 0.375, 0.75, 0.5
+_USUAL, _CONTRADICTED, _OF_BEST = 0.3375, 0.625, 0.5
 """A cumulative sum (E. S. Page, Biometrika 41, 1954) takes the evidence against the platform's IMU, in sigma. Each evaluation
 adds what it has beyond the first share of the limit (in sigma, too), or takes off what it lacks. From the second share on, the
 sum ends the run. Evidence of less than the last share of the most evidence (both are squares of sigma) counts as none.
@@ -152,6 +148,7 @@ STATE = record_dtype(
     suspicion=np.int64,  # for how many more evaluations it is suspected
     lasting=(np.float64, 2),  # square of what has lasted long enough to end a run, and of its limit; 0 if nothing has
     lasting_imu=np.int64,  # the IMU that it blames
+    least_evidence=np.float64,  # from how much on the evidence of the last evaluation ends a run, or leaves out an IMU
 )
 """What the rig has reported, and what lasts."""
 
@@ -460,16 +457,17 @@ def judge_evidence(
             w.cleared_for[k] = imus.excluded[k] = 0
             w.returns[k] += 1
             back = True
-    rest, usual_rest = e.all_evidence - e.imu_evidence, _REST_OF_ALL * e.imu_evidence
+    rest, most_rest = e.all_evidence - e.imu_evidence, _REST * limit + _REST_OF_ALL * e.imu_evidence
     if back:
         _count_anew(w)
     elif judged:
-        _count_evaluations(p.watch, w, e, rest, usual_rest)
-    if back or not _moves(s):
-        return back
+        _count_evaluations(p.watch, w, e, rest, most_rest)
     k = e.blamed
     ends = k < 0 or _is_needed(p.watch, k)
     least = _ENDING * limit if ends and judged and e.evaluations >= _FIRST_COUNTED else limit
+    w.least_evidence = least
+    if back or not _moves(s):
+        return back
     seen, most = e.best_evidence >= least, np.sqrt(least)
     if seen and k < 0:
         cause = Cause.GYROSCOPES_SHARE + e.shared
@@ -477,7 +475,7 @@ def judge_evidence(
         _report_rival(s, e, -1)
         return False
     clear = e.rival_evidence < e.imu_evidence - max(_CLEARLY * limit, _CLEARLY_OF_ALL * e.imu_evidence)
-    rest_agrees = rest < _REST * limit + usual_rest
+    rest_agrees = rest < most_rest
     alone = clear and rest_agrees and e.evidence.of_learned == 0 and w.suspicion == 0
     if seen and alone and _may_leave_out(p.watch, imus, k):
         imus.excluded[k] = 1
@@ -497,12 +495,12 @@ def judge_evidence(
 
 
 @kernel
-def _count_evaluations(p: Record, w: Record, e: Record, rest: float, usual_rest: float) -> None:
+def _count_evaluations(p: Record, w: Record, e: Record, rest: float, most_rest: float) -> None:
     """Count the evaluations in a row that leave too much unexplained; and add up the evidence against the platform's IMU, if it
     is needed.
     """
     counts, sigma = e.evaluations >= _FIRST_COUNTED, np.sqrt(p.evidence)
-    most_rest, most = _UNEXPLAINED * p.evidence + usual_rest, _CONTRADICTED * sigma
+    most = _CONTRADICTED * sigma
     w.unexplained_for = w.unexplained_for + 1 if counts and rest >= most_rest else 0
     found = e.platform_evidence if e.platform_evidence >= _OF_BEST * e.best_evidence else 0.0
     beyond = np.sqrt(max(found, 0.0)) - _USUAL * sigma

@@ -259,7 +259,7 @@ def test_evidence_of_either_kind_prevents_arming(hexapod, kind, blamed):
     limit = float(bench.parameters["safety"]["watch"]["evidence"])
     arming = bench.state["safety"]["arming"]
     for size, armed in ((1.01, False), (0.99, True)):
-        arming["evidence"][kind], arming["blamed"][kind] = size * limit, blamed
+        arming["evidence"][kind], arming["blamed"][kind], arming["most_evidence"][kind] = size * limit, blamed, limit
         bench.step()
         bench.step()
         assert (bench.mode == Mode.RUNNING) == armed
