@@ -82,10 +82,10 @@ _FAST_S = 0.1
 _OSCILLATING_S = 1.0
 """For how long a mean square must be beyond its limit: a step of the estimate is corrected in less [s]."""
 
-_TURNING = radians(2.2)
-"""If the platform turns to and fro by more than this [rad/s RMS] beyond what is planned, it oscillates. Then the gains are
-halved: at first beyond a quarter of the limit (RMS) for a quarter of that time, then beyond a half for a half. Twice as far
-beyond, it takes half the time. If the platform does not turn, only IMUs are shaken, and lower gains do not help.
+_SWAYING, _TURNING = 0.011, radians(2.2)
+"""If the platform moves or turns to and fro by more than this [m/s, rad/s RMS] beyond what is planned, it oscillates. Then the
+gains are halved: at first beyond a quarter of the limit (RMS) for a quarter of that time, then beyond a half for a half. Twice
+as far beyond, it takes a quarter of the time. If the platform does neither, only IMUs are shaken, and lower gains do not help.
 """
 
 _BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0
@@ -136,8 +136,8 @@ STATE = record_dtype(
     correction=(np.float64, LEGS),  # of each command beyond its feed-forward, averaged [m/s]
     oscillation=(np.float64, LEGS),  # square of what the correction is apart from that, averaged [m^2/s^2]
     oscillating_for=np.float64,  # how long the mean of these squares has been beyond its limit [s]
-    turn=(np.float64, 3),  # angular velocity beyond the planned one, averaged [rad/s]
-    turning=(np.float64, 3),  # square of what it is apart from that, averaged [rad^2/s^2]
+    sway=(np.float64, 6),  # twist beyond the planned one, averaged [m/s, rad/s]
+    swaying=(np.float64, 6),  # square of what it is apart from that, averaged [m^2/s^2, rad^2/s^2]
     speed=(np.float64, LEGS),  # estimated, of each leg [m/s]
     variance=(np.float64, 2),  # of the least known direction, of the leg filters and of the whole-mechanism filter [rad^2]
     calm_variance=(np.float64, 2),  # the same when nothing shook the IMUs last
@@ -303,8 +303,8 @@ def check_oscillation(
     pid: Record,
 ) -> None:  # fmt: skip
     """After the commands: halve the gains when what the PIDs add to the feed-forward (6,) [m/s] goes to and fro for long, fast
-    and far, and turns the platform, as it does where the legs have play. Stop when that does not help, or when it shakes the
-    IMUs without turning the platform. If it does neither, it is noise of the estimate.
+    and far, and moves or turns the platform, as it does where the legs have play. Stop when that does not help, or when it
+    shakes the IMUs without moving the platform. If it does neither, it is noise of the estimate.
 
     Args:
         twist: (6,), of the platform beyond the planned one, by all gyroscopes [m/s, rad/s].
@@ -315,13 +315,14 @@ def check_oscillation(
         _take_oscillation(share, pid.command[k] - feed_forward[k], k, w.correction, w.oscillation)
         if w.oscillation[k] > w.oscillation[worst]:
             worst = k
-    for i in range(3):
-        _take_oscillation(share, twist[3 + i], i, w.turn, w.turning)
-    rms, turning = np.sqrt(w.oscillation[: rig.legs].mean()), np.sqrt(w.turning.sum())
-    left = MOST_HALVINGS - pid.halvings if turning > _TURNING else 0
+    for i in range(6):
+        _take_oscillation(share, twist[i], i, w.sway, w.swaying)
+    rms = np.sqrt(w.oscillation[: rig.legs].mean())
+    sways = w.swaying[:3].sum() > _SWAYING**2 or w.swaying[3:].sum() > _TURNING**2
+    left = MOST_HALVINGS - pid.halvings if sways else 0
     limit = np.sqrt(p.watch.oscillation) / 2**left
-    oscillates = rms > limit and (turning > _TURNING or shaking.told != 0) and s.mode == Mode.RUNNING
-    sooner = rms / limit if left > 0 else 1.0
+    oscillates = rms > limit and (sways or shaking.told != 0) and s.mode == Mode.RUNNING
+    sooner = (rms / limit) ** 2 if left > 0 else 1.0
     w.oscillating_for = w.oscillating_for + passed * sooner if oscillates else 0.0
     if w.oscillating_for > _OSCILLATING_S / 2**left:
         w.oscillating_for = 0.0

@@ -533,17 +533,19 @@ def corrections_bear(seconds, amplitude, frequency, **run):
     return None if state["safety"]["stop"]["cause"] == Cause.NONE else (stop_of(state), after)
 
 
-def oscillated(seconds, amplitude, frequency, told=1, mode=Mode.RUNNING, steady=0.0, turning=0.0):
-    """The state after so long of such commands of all legs, or when they have ended the run, and how long that was [s]."""
+def oscillated(seconds, amplitude, frequency, told=1, mode=Mode.RUNNING, steady=0.0, axis=4, sway=0.0):
+    """The state after so long of such commands of all legs, or when they have ended the run, and how long that was [s]. The
+    platform moves to and fro along or about an axis by so much [m/s, rad/s RMS].
+    """
     _, parameters, state = moving()
     s, period = state["safety"], float(parameters["rig"]["period"])
-    state["imus"]["shaking"]["told"], s["mode"], s["watch"]["turn"][1] = told, mode, 0.3
+    state["imus"]["shaking"]["told"], s["mode"], s["watch"]["sway"][axis] = told, mode, 0.3
     feed_forward, twist = np.linspace(-0.1, 0.1, 6), np.zeros(6)
     phases = np.arange(6.0)
     for cycle in range(round(seconds / period)):
         turn = 2.0 * np.pi * frequency * period * cycle
         state["pid"]["command"] = feed_forward + steady + amplitude * np.sin(turn + phases)
-        twist[4] = 0.3 + np.sqrt(2.0) * turning * np.sin(turn)
+        twist[axis] = 0.3 + np.sqrt(2.0) * sway * np.sin(turn)
         check_oscillation(
             parameters["safety"][()], s[()], parameters["rig"][()], state["time"][()], state["imus"]["shaking"][()], twist,
             feed_forward, state["reference"][()], state["pid"][()],
@@ -563,21 +565,22 @@ def test_commands_that_oscillate_while_the_imus_are_shaken_end_a_run_after_a_sec
 
 
 @pytest.mark.parametrize("told", [0, 1])
-def test_a_platform_that_oscillates_has_its_gains_halved_twice_and_is_stopped_if_that_does_not_help(told):
-    limit = SafetySettings().oscillation
+@pytest.mark.parametrize(("axis", "most"), [(2, 0.011), (4, np.radians(2.2))])
+def test_a_platform_that_oscillates_has_its_gains_halved_twice_and_is_stopped_if_that_does_not_help(axis, most, told):
+    limit, sways = SafetySettings().oscillation, {"axis": axis, "sway": 1.36 * most}
     for share, seconds, halvings in (
         (0.24, 3.0, 0), (0.3, 0.15, 0), (0.3, 0.5, 1), (0.48, 3.0, 1), (0.6, 0.08, 0), (0.6, 0.4, 1), (0.6, 0.9, 2),
-        (0.95, 3.0, 2),
+        (0.95, 0.13, 1), (0.95, 3.0, 2),
     ):  # fmt: skip
-        state, _ = oscillated(seconds, share * np.sqrt(2.0) * limit, 18.0, told, turning=np.radians(3.0))
+        state, _ = oscillated(seconds, share * np.sqrt(2.0) * limit, 18.0, told, **sways)
         assert state["pid"]["halvings"] == halvings, (share, seconds)
         events = state["safety"]["events"]
         assert events["cause"][:halvings].tolist() == [Cause.GAINS_HALVED] * halvings and events["count"] == halvings
         np.testing.assert_allclose(events["limit"][:halvings], limit * np.array([0.25, 0.5])[:halvings])
         assert state["safety"]["mode"] == Mode.RUNNING
-    state, after = oscillated(3.0, 1.2 * np.sqrt(2.0) * limit, 18.0, told, turning=np.radians(3.0))
+    state, after = oscillated(3.0, 1.2 * np.sqrt(2.0) * limit, 18.0, told, **sways)
     assert state["pid"]["halvings"] == 2 and stop_of(state)[0] == Cause.OSCILLATES and 1.2 < after < 1.5
-    calm, _ = oscillated(3.0, 0.6 * np.sqrt(2.0) * limit, 18.0, told, turning=np.radians(2.0))
+    calm, _ = oscillated(3.0, 0.6 * np.sqrt(2.0) * limit, 18.0, told, axis=axis, sway=0.91 * most)
     assert calm["pid"]["halvings"] == 0
 
 
