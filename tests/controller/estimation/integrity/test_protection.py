@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from controller.estimation.integrity import stage
 from controller.estimation.integrity.evidence import STATE
 from controller.estimation.integrity.hypotheses import HYPOTHESES, directions_of, evidence_for, span_of
 from controller.estimation.integrity.protection import begin_level, end_level, publish_level, take_hypothesis
+from plant.imu import ACCELEROMETER, GYROSCOPE
 from tests.controller.estimation.integrity.made_up import constants
 from tests.controller.estimation.integrity.test_evidence import evaluated
 from tests.controller.estimation.integrity.test_hypotheses import all_steps, readings
@@ -156,6 +158,18 @@ def test_forces_that_are_no_motion_raise_the_level_between_evaluations():
     for excess, shaken in ((np.inf, 0.4), (1e12, 0.98 * 0.4 + 3.2), (0.0, 0.98 * (0.98 * 0.4 + 3.2))):
         publish_level(level[()], 50.0, 0.0, 0.01, 0.0, excess, *np.zeros((5, 2)))
         assert level["shaken"] == pytest.approx(shaken)
+
+
+def test_vibration_in_the_level_is_the_greatest_excess_of_an_accelerometer():
+    """The root of 4 m^2/s^4 counts by its share of an average over 0.5 s; gyroscopes have other units."""
+    parameters, state = evaluated()
+    state["integrity"]["evaluations"], state["imus"]["shaking"]["excess"][GYROSCOPE] = 1, 9.0
+    state["imus"]["shaking"]["excess"][ACCELEROMETER] = np.arange(7.0) - 2.0
+    level = state["integrity"]["protection"]
+    before = float(level["shaken"])
+    p, s = parameters[()], state[()]
+    stage.publish_level(p["integrity"], s["integrity"], p["rig"], s["time"], s["imus"], s["pose"])
+    assert level["shaken"] == pytest.approx(before + float(p["rig"]["period"]) / 0.5 * (2.0 - before))
 
 
 def test_what_was_not_commanded_and_two_estimates_that_are_apart_raise_the_level():
