@@ -293,13 +293,13 @@ def _check_settings(config: SimulationConfig, description: FmuDescription) -> No
         if tables and each.name not in description:
             line = replace(each, name=name, at=None).text.replace("=", " = ")
             if config.mechanism.endswith(".toml"):
-                remedy = f"write {line} into that table of {config.mechanism}"
+                remedy = f"Write {line} into that table of {config.mechanism}"
             else:
                 lines = f'based_on = "{config.mechanism}", {tables} and {line}'
-                remedy = f"write a file with the lines {lines}, and name it by --mechanism FILE.toml"
+                remedy = f"Write a file with the lines {lines}, and name it by --mechanism FILE.toml"
             raise InputError(
-                f"{each.name} is no variable of {description.path.name}: it is a setting of the controller, in the table "
-                f"{tables} of the mechanism's file; {remedy}"
+                f"{each.name} is no variable of {description.path.name}. It is a setting of the controller, in the table "
+                f"{tables} of the mechanism's file. {remedy}"
             )
 
 
