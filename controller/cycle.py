@@ -57,7 +57,7 @@ from controller.imu_set import are_few, check_imus, imus_of, length_share, lengt
 from controller.inverse_kinematics import legs_at
 from controller.least_squares import RANK_TOLERANCE
 from controller.rig import RIG, TIME, elapsed, field_of, rig_parameters
-from controller.safety import arming, drives, encoder_watch, watch
+from controller.safety import arming, attribution, drives, encoder_watch, watch
 from controller.safety.causes import Cause, Mode, Request
 from controller.safety.stop import handle_cause, ramp_down
 from controller.settings import ControlSettings, DriveSettings, FusionSettings, SafetySettings
@@ -385,7 +385,7 @@ def run_stages(
             imu_monitor.look_at_next(
                 p.safety.monitor, s.safety.monitor, s.pose, s.legs.directions, s.legs.weights, rig.vectors_in_base[0]
             )
-            if watch.exclude_imu(p.safety, s.safety, rig, time, s.imus, p.legs.weight, s.reference, s.pid):
+            if attribution.exclude_imu(p.safety, s.safety, rig, time, s.imus, p.legs.weight, s.reference, s.pid):
                 trust.restart_filter(s.mechanism, time)
                 integrity.restart_integrity(p.integrity, s.integrity)
         t = _mark(m, CycleStage.REFINEMENT, t)
@@ -425,7 +425,7 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         by_legs = spread_by_legs(s.integrity.gravity, s.imus) if alone else 0.0
         end_level(level, s.integrity.evidence, time.cycle * rig.period, by_legs)
     integrity.publish_level(p.integrity, s.integrity, rig, time, s.imus, s.pose)
-    changed = s.integrity.contradicts != 0 and watch.judge_parity(
+    changed = s.integrity.contradicts != 0 and attribution.judge_parity(
         p.safety, s.safety, rig, time, s.imus, s.integrity.parity, s.reference, s.pid
     )
     if changed:
@@ -437,7 +437,7 @@ def _check_integrity(parameters: Record, state: Record) -> None:
             watch.check_drift(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid)
     # What parity has just left out is still in the evidence.
     judged = s.integrity.fresh != 0 and not changed
-    if judged and watch.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
+    if judged and attribution.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
         trust.restart_filter(s.mechanism, time)
         integrity.restart_integrity(p.integrity, s.integrity)
 

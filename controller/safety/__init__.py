@@ -3,7 +3,7 @@
 import numpy as np
 
 from controller.estimation import imu_monitor
-from controller.safety import arming, drives, encoder_watch, stop, watch
+from controller.safety import arming, attribution, drives, encoder_watch, stop, watch
 from controller.safety.causes import EVENTS
 from controller.settings import DriveSettings, SafetySettings
 from plant.compiled import Record, filled, record_dtype
@@ -27,6 +27,7 @@ STATE = record_dtype(
     arming=arming.STATE,
     monitor=imu_monitor.STATE,
     watch=watch.STATE,
+    attribution=attribution.STATE,
     drives=drives.STATE,
     encoders=encoder_watch.STATE,
     stop=stop.STATE,

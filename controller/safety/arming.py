@@ -104,7 +104,7 @@ def run_arming_checks(
     if integrity.fresh != 0:
         kind = integrity.evidence.of_learned
         a.evidence[kind], a.blamed[kind] = integrity.best_evidence, integrity.blamed
-        a.most_evidence[kind] = s.watch.least_evidence
+        a.most_evidence[kind] = s.attribution.least_evidence
     if time.cycle < rig.hold_cycles or s.mode > Mode.ARMED:
         return
     if s.mode == Mode.IDLE:
@@ -218,9 +218,9 @@ def _find_obstacle(
         if a.evidence[kind] > a.most_evidence[kind]:
             cause = Cause.NO_TRUST.value if a.blamed[kind] < 0 else Cause.NO_SENSORS.value
             return cause, a.blamed[kind], np.sqrt(a.evidence[kind]), np.sqrt(a.most_evidence[kind])
-    lasting = s.watch.lasting
+    lasting = s.attribution.lasting
     if lasting[1] > 0.0:
-        blamed = s.watch.lasting_imu
+        blamed = s.attribution.lasting_imu
         cause = Cause.NO_TRUST.value if blamed < 0 else Cause.NO_SENSORS.value
         return cause, blamed, np.sqrt(lasting[0]), np.sqrt(lasting[1])
     level = integrity.protection.level

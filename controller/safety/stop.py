@@ -134,6 +134,12 @@ def ramp_down(p: Record, rig: Record, time: Record, pid: Record) -> None:
 
 
 @kernel
+def moves(s: Record) -> bool:
+    """Whether the loop moves the legs: in the motion, and in a controlled stop, which needs the estimate as well."""
+    return bool(s.mode == Mode.RUNNING or s.mode == Mode.STOPPING)
+
+
+@kernel
 def has_stopped(s: Record, time: Record) -> bool:
     """Whether a stop or a fault has come to its end, so that the brakes may hold; a stop becomes `Mode.STOPPED` then."""
     ended = s.stop.cause != Cause.NONE and time.cycle >= s.stop.end_cycle

@@ -238,9 +238,9 @@ def test_evidence_below_its_limit_that_lasts_prevents_arming(hexapod, blamed):
     """It would end the run at once."""
     bench = Bench(hexapod)
     bench.steps(bench.hold - 1)
-    lasting = bench.state["safety"]["watch"]["lasting"]
+    lasting = bench.state["safety"]["attribution"]["lasting"]
     lasting[:] = 25.0, 24.0
-    bench.state["safety"]["watch"]["lasting_imu"] = blamed
+    bench.state["safety"]["attribution"]["lasting_imu"] = blamed
     bench.steps(2)
     assert bench.mode == Mode.IDLE
     cause = Cause.NO_TRUST if blamed < 0 else Cause.NO_SENSORS
