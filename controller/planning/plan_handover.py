@@ -157,7 +157,7 @@ def _used(rows: Array) -> int:
 
 @kernel
 def fail_stream(stream: Record, cause: int, index: int, value: float, limit: float) -> None:
-    """Report why the stream has failed, a cause of `controller.safety.watch`; the first report counts."""
+    """Report why the stream has failed, a `Cause`; the first report counts."""
     s = stream[()]
     if load_acquire(s.shared, CAUSE) == Cause.NONE:
         s.index, s.value, s.limit = index, value, limit

@@ -59,7 +59,7 @@ _STROKE_SLACK_M = 1e-9
 
 
 class TargetRefusedError(GoughError, ValueError):
-    """A sample cannot be followed. Attributes: cause (of `controller.safety.watch`), leg, value and limit."""
+    """A sample cannot be followed. Attributes: cause (a `Cause`), leg, value and limit."""
 
     def __init__(self, cause: int, index: int = 0, value: float = np.nan, limit: float = np.nan) -> None:
         super().__init__(f"{Cause(cause).describe(index, value, limit)}: correct what sends the target")

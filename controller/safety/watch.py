@@ -34,8 +34,8 @@ _OSCILLATING_S = 1.0
 
 _SWAYING, _TURNING = 0.011, radians(2.2)
 """If the platform moves or turns to and fro by more than this [m/s, rad/s RMS] beyond what is planned, it oscillates. Then the
-gains are halved: at first beyond a quarter of the limit (RMS) for a quarter of that time, then beyond a half for a half. Twice
-as far beyond, it takes a quarter of the time. If the platform does neither, only IMUs are shaken, and lower gains do not help.
+gains are halved: at first beyond a quarter of the limit (RMS) for a quarter of that time, then beyond a half for a half. At
+twice as much, it takes a quarter of the time. If the platform does neither, only IMUs are shaken, and lower gains do not help.
 """
 
 _BASE_IMU_S, _FIRST_BASE_IMU_S = 0.01, 1.0

@@ -161,7 +161,7 @@ def evaluations_until_a_stop(parameters, state, most=30):
     return None
 
 
-@pytest.mark.parametrize(("in_all", "evaluations", "expected"), [(10.0, 20, None), (12.0, 20, 3), (12.0, 18, None)])
+@pytest.mark.parametrize(("in_all", "evaluations", "expected"), [(10.5, 20, None), (10.7, 20, 3), (10.7, 18, None)])
 def test_three_evaluations_that_no_single_imu_explains_end_a_motion_below_the_limit(in_all, evaluations, expected):
     """With 6 of 8 sigma against IMU 2, the limit is the root of 64 and 0.35 x 36. The first two seconds do not count."""
     _, parameters, state = moving()
@@ -258,43 +258,76 @@ def test_a_sum_that_grew_on_the_brakes_delays_arming_by_a_limited_time():
     assert lasted == 8
 
 
-@pytest.mark.parametrize(
-    ("imu", "evidence", "changes", "expected"),
+LEAST_EVIDENCE = pytest.mark.parametrize(
+    ("imu", "evidence", "changes", "limit"),
     [
-        (-1, 5.7, {}, 1),
+        (-1, 5.7, {}, np.sqrt(32.0)),
         (-1, 5.6, {}, None),
-        (6, 5.7, {}, 1),
+        (6, 5.7, {}, np.sqrt(32.0)),
         (2, 7.9, {}, None),
         (-1, 6.6, {"evaluations": 19}, None),
         (-1, 7.9, {"of_learned": 1}, None),
-        (-1, 8.1, {"of_learned": 1, "evaluations": 19}, 1),
+        (-1, 8.1, {"of_learned": 1, "evaluations": 19}, 8.0),
+        (-1, 20.0, {"limit": np.inf}, None),
     ],
 )
-def test_less_evidence_ends_a_motion_where_no_imu_could_be_left_out(imu, evidence, changes, expected):
-    """All share the error, or it is the platform's: the root of half of 64, in recent readings, after the first two seconds.
-    What would end a motion at once prevents arming, too.
-    """
-    for mode in (Mode.IDLE, Mode.RUNNING):
-        _, parameters, state = moving(mode=mode)
-        integrity = state["integrity"]
-        integrity["evaluations"] = changes.get("evaluations", 20)
-        integrity["evidence"]["of_learned"] = changes.get("of_learned", 0)
-        integrity["fresh"], integrity["shared"] = 1, 0
-        weigh(state, imu, evidence, evidence)
-        if mode == Mode.IDLE:
-            judge(parameters, state)
-            state["time"]["cycle"] = parameters["rig"]["hold_cycles"]
-            run_arming_checks(
-                parameters["safety"][()], state["safety"][()], parameters["rig"][()], state["time"][()], parameters["imus"][()],
-                state["imus"][()], integrity[()], state["pose"][()], state["reference"][()], state["pid"][()],
-            )  # fmt: skip
-            obstacle = Cause(int(state["safety"]["arming"]["obstacle"]))
-            assert (obstacle == (Cause.NO_TRUST if imu < 0 else Cause.NO_SENSORS)) == bool(expected)
-    assert evaluations_until_a_stop(parameters, state, 5) == expected
-    if expected:
+"""All share the error, or it is the platform's: the root of half of 64, in recent readings, after the first two seconds."""
+
+
+def with_evidence(mode, imu, evidence, changes):
+    """A cycle in which an evaluation has just found it, of the 20th or so on."""
+    _, parameters, state = moving(mode=mode)
+    parameters["safety"]["watch"]["evidence"] = changes.get("limit", 64.0)
+    integrity = state["integrity"]
+    integrity["evaluations"] = changes.get("evaluations", 20)
+    integrity["evidence"]["of_learned"] = changes.get("of_learned", 0)
+    integrity["fresh"], integrity["shared"] = 1, 0
+    weigh(state, imu, evidence, evidence)
+    return parameters, state
+
+
+@LEAST_EVIDENCE
+def test_less_evidence_ends_a_motion_where_no_imu_could_be_left_out(imu, evidence, changes, limit):
+    parameters, state = with_evidence(Mode.RUNNING, imu, evidence, changes)
+    assert evaluations_until_a_stop(parameters, state, 5) == (1 if limit else None)
+    if limit:
         cause = Cause.GYROSCOPES_SHARE if imu < 0 else Cause.IMUS_CONTRADICT
-        limit = 8.0 if changes else np.sqrt(32.0)
         assert stop_of(state) == (cause, imu, pytest.approx(evidence), pytest.approx(limit))
+
+
+@LEAST_EVIDENCE
+def test_evidence_that_would_end_a_motion_prevents_arming(imu, evidence, changes, limit):
+    parameters, state = with_evidence(Mode.IDLE, imu, evidence, changes)
+    assert obstacle_after_evidence(parameters, state)[0] == (Cause.NOT_STILL if limit is None else blamed(imu))
+    if limit:
+        assert obstacle_after_evidence(parameters, state)[1:] == (imu, pytest.approx(evidence), pytest.approx(limit))
+
+
+def test_evidence_that_would_leave_out_an_imu_prevents_arming():
+    assert obstacle_after_evidence(*with_evidence(Mode.IDLE, 2, 8.1, {}))[:2] == (Cause.NO_SENSORS, 2)
+
+
+def test_between_armed_and_running_such_evidence_ends_the_run():
+    parameters, state = with_evidence(Mode.ARMED, -1, 5.7, {})
+    obstacle_after_evidence(parameters, state)
+    assert stop_of(state) == (Cause.NO_TRUST, -1, pytest.approx(5.7), pytest.approx(np.sqrt(32.0)))
+
+
+def blamed(imu):
+    return Cause.NO_TRUST if imu < 0 else Cause.NO_SENSORS
+
+
+def obstacle_after_evidence(parameters, state):
+    """What then is in the way of arming: cause, IMU, value and limit."""
+    p, s = parameters, state
+    judge(p, s)
+    s["time"]["cycle"] = p["rig"]["hold_cycles"]
+    run_arming_checks(
+        p["safety"][()], s["safety"][()], p["rig"][()], s["time"][()], p["imus"][()], s["imus"][()], s["integrity"][()],
+        s["pose"][()], s["reference"][()], s["pid"][()],
+    )  # fmt: skip
+    arming = s["safety"]["arming"]
+    return Cause(int(arming["obstacle"])), int(arming["index"]), float(arming["value"]), float(arming["limit"])
 
 
 @pytest.mark.parametrize("change", ["back", "parity"])
