@@ -41,6 +41,11 @@ adds what it has beyond the first share of the limit (in sigma, too), or takes o
 sum ends the run. Evidence of less than the last share of the most evidence (both are squares of sigma) counts as none.
 """
 
+_FITTING, _USUAL_WHERE_FITTING = 0.5, 0.4375
+"""Where the misfit of the closed form is less than the first, more evidence is usual: this share of the limit. An IMU that has
+turned by a degree does not fit the others' directions, while play and joints that are off are evidence that fits them well.
+"""
+
 _SUSPECTED, _SUSPICION_EVALUATIONS = 0.375, 20
 """The platform's IMU is suspected while the sum is at least this share of the limit, and for so many evaluations from the last
 such one on. In that time evidence leaves out no other IMU. The pose follows the platform's IMU. If that turns slowly, the pose
@@ -208,7 +213,8 @@ def _count_evaluations(p: Record, a: Record, e: Record, rest: float, most_rest: 
     most = _CONTRADICTED * sigma
     a.unexplained_for = a.unexplained_for + 1 if counts and rest >= most_rest else 0
     found = e.platform_evidence if e.platform_evidence >= _OF_BEST * e.best_evidence else 0.0
-    beyond = np.sqrt(max(found, 0.0)) - _USUAL * sigma
+    usual = _USUAL_WHERE_FITTING if e.protection.misfit < _FITTING else _USUAL
+    beyond = np.sqrt(max(found, 0.0)) - usual * sigma
     # What adds up on the brakes may delay arming by a limited time only.
     added = min(max(a.against_platform + beyond, 0.0), 2.0 * most)
     a.against_platform = added if counts and _is_needed(p, PLATFORM_IMU) else 0.0
