@@ -19,9 +19,9 @@ _MOST_DOUBLINGS = 20
 _CLEARLY, _CLEARLY_OF_ALL = 0.5, 0.25
 """How much less than for the named IMU the evidence for anything else must be: of the limit, and of that evidence."""
 
-_REST, _REST_OF_ALL, _UNEXPLAINED_EVALUATIONS = 1.0, 0.35, 3
-"""How much evidence for further faults may be left without the named IMU: so many times the limit, and this share of the
-evidence for it on top. A fault that has just come up is not constant over the memory of the fault filter, and leaves up to a
+_REST, _REST_OF_ALL, _UNEXPLAINED_EVALUATIONS = 0.75, 0.35, 3
+"""How much evidence for further faults may be left without the named IMU: this share of the limit, and on top this share of the
+evidence for it. A fault that has just come up is not constant over the memory of the fault filter, and leaves up to a
 third of its own evidence.
 
 If more is left in so many evaluations in a row, more than one IMU is wrong, though none of them may be beyond the limit.

@@ -162,16 +162,16 @@ def evaluations_until_a_stop(parameters, state, most=30):
     return None
 
 
-@pytest.mark.parametrize(("in_all", "evaluations", "expected"), [(10.5, 20, None), (10.7, 20, 3), (10.7, 18, None)])
+@pytest.mark.parametrize(("in_all", "evaluations", "expected"), [(9.7, 20, None), (9.9, 20, 3), (9.9, 18, None)])
 def test_three_evaluations_that_no_single_imu_explains_end_a_motion_below_the_limit(in_all, evaluations, expected):
-    """With 6 of 8 sigma against IMU 2, the limit is the root of 64 and 0.35 x 36. The first two seconds do not count."""
+    """With 6 of 8 sigma against IMU 2, the limit is the root of 0.75 x 64 and 0.35 x 36. The first two seconds do not count."""
     _, parameters, state = moving()
     state["integrity"]["evaluations"] = evaluations
     weigh(state, 2, 6.0, in_all)
     assert evaluations_until_a_stop(parameters, state) == expected
     if expected:
         left = np.sqrt(in_all**2 - 36.0)
-        assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(left), pytest.approx(np.sqrt(64.0 + 12.6)))
+        assert stop_of(state) == (Cause.IMUS_CONTRADICT, 2, pytest.approx(left), pytest.approx(np.sqrt(48.0 + 12.6)))
 
 
 def test_unexplained_evidence_must_come_in_evaluations_in_a_row_of_recent_readings():
