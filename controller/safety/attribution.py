@@ -42,8 +42,9 @@ sum ends the run. Evidence of less than the last share of the most evidence (bot
 """
 
 _FITTING, _USUAL_WHERE_FITTING = 0.5, 0.4375
-"""Where the misfit of the closed form is less than the first, more evidence is usual: this share of the limit. An IMU that has
-turned by a degree does not fit the others' directions, while play and joints that are off are evidence that fits them well.
+"""Below this misfit of the closed form, and where it has none, the sum takes only what is beyond this share of the limit. An
+IMU that tilts by some degree raises the misfit. Play, and joints that are off by 0.1 mm, raise the evidence, but hardly the
+misfit.
 """
 
 _SUSPECTED, _SUSPICION_EVALUATIONS = 0.375, 20

@@ -215,7 +215,7 @@ def test_evidence_that_adds_up_against_the_platforms_imu_ends_a_motion(imu, need
 
 @pytest.mark.parametrize(("misfit", "evidence", "expected"), [(0.51, 3.4, 8), (0.49, 3.4, None), (0.49, 4.0, 10)])
 def test_where_the_closed_form_fits_more_evidence_against_the_platforms_imu_is_usual(misfit, evidence, expected):
-    """What is beyond 3.5 of 8 sigma adds up there, up to 5: play and joints that are off hardly show in the closed form."""
+    """There, what is beyond 3.5 of 8 sigma adds up, to 5: play and joints that are off by 0.1 mm hardly raise the misfit."""
     _, parameters, state = moving()
     state["integrity"]["evaluations"] = 20
     weigh(state, 6, evidence, 7.0, misfit=misfit)
