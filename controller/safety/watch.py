@@ -33,7 +33,8 @@ _OSCILLATING_S = 1.0
 """For how long a mean square must be beyond its limit: a step of the estimate is corrected in less [s]."""
 
 _SWAYING, _TURNING = 0.011, radians(2.2)
-"""If the platform moves or turns to and fro by more than this [m/s, rad/s RMS] beyond what is planned, it oscillates. Then the
+"""If the platform turns to and fro by more than the second [rad/s RMS] beyond what is planned, it oscillates. The same holds if
+it moves by more than the first [m/s RMS] while the IMUs are shaken: a single step of the pose shakes them too little. Then the
 gains are halved: at first beyond a quarter of the limit (RMS) for a quarter of that time, then beyond a half for a half. At
 twice as much, it takes a quarter of the time. If the platform does neither, only IMUs are shaken, and lower gains do not help.
 """
@@ -213,7 +214,8 @@ def check_oscillation(
     for i in range(6):
         _take_oscillation(share, twist[i], i, w.sway, w.swaying)
     rms = np.sqrt(w.oscillation[: rig.legs].mean())
-    sways = w.swaying[:3].sum() > _SWAYING**2 or w.swaying[3:].sum() > _TURNING**2
+    heaves = shaking.told != 0 and w.swaying[:3].sum() > _SWAYING**2
+    sways = heaves or w.swaying[3:].sum() > _TURNING**2
     left = MOST_HALVINGS - pid.halvings if sways else 0
     limit = np.sqrt(p.watch.oscillation) / 2**left
     oscillates = rms > limit and (sways or shaking.told != 0) and s.mode == Mode.RUNNING

@@ -81,7 +81,7 @@ def test_a_setting_of_the_controller_belongs_into_a_mechanism_s_own_file(tmp_pat
     path.write_text('based_on = "hexapod"')
     mechanism = load_in_space(str(path))
     config = SimulationConfig(mechanism=str(path), settings=(Setting.parse("leg_sigma=1e-3"),))
-    with pytest.raises(InputError, match=r"write leg_sigma = 0\.001 into that table of .*own\.toml"):
+    with pytest.raises(InputError, match=r"Write leg_sigma = 0\.001 into that table of .*own\.toml"):
         simulated_plant(config, mechanism, mechanism.home)
 
 
