@@ -49,7 +49,7 @@ STATE = record_dtype(
     approach_cycles=np.int64,  # how long that takes
     evidence=(np.float64, 2),  # for a fault, of the last evaluation of recent readings, and of the last one of what was learned
     blamed=(np.int64, 2),  # the IMU that it is against; -1 if it is against all
-    most_evidence=(np.float64, 2),  # beyond what it would end a motion
+    most_evidence=(np.float64, 2),  # beyond what it would end a motion, or leave out an IMU
 )
 """How arming goes."""
 

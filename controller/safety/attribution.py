@@ -42,9 +42,9 @@ sum ends the run. Evidence of less than the last share of the most evidence (bot
 """
 
 _FITTING, _USUAL_WHERE_FITTING = 0.5, 0.4375
-"""Below this misfit of the closed form, and where it has none, the sum takes only what is beyond this share of the limit. An
-IMU that tilts by some degree raises the misfit. Play, and joints that are off by 0.1 mm, raise the evidence, but hardly the
-misfit.
+"""If the misfit of the closed form is below the first, the sum takes only what is beyond the second, a share of the limit. An
+IMU that tilts by about a degree raises the misfit. Play, and joints that are off by 0.1 mm, raise the evidence, but hardly the
+misfit. Without redundancy, and where encoders lead, the misfit is 0.
 """
 
 _SUSPECTED, _SUSPICION_EVALUATIONS = 0.375, 20

@@ -214,8 +214,8 @@ def check_oscillation(
     for i in range(6):
         _take_oscillation(share, twist[i], i, w.sway, w.swaying)
     rms = np.sqrt(w.oscillation[: rig.legs].mean())
-    heaves = shaking.told != 0 and w.swaying[:3].sum() > _SWAYING**2
-    sways = heaves or w.swaying[3:].sum() > _TURNING**2
+    translates = shaking.told != 0 and w.swaying[:3].sum() > _SWAYING**2
+    sways = translates or w.swaying[3:].sum() > _TURNING**2
     left = MOST_HALVINGS - pid.halvings if sways else 0
     limit = np.sqrt(p.watch.oscillation) / 2**left
     oscillates = rms > limit and (sways or shaking.told != 0) and s.mode == Mode.RUNNING
