@@ -337,6 +337,12 @@ def conditionings(
     return found
 
 
+def kernels_of_conditionings() -> tuple[tuple[Any, ...], ...]:
+    """The kernel of `conditionings`, with arguments, as `load_kernels` takes it."""
+    records, poses = (np.zeros((), dtype) for dtype in (PARAMETERS, STATE, RIG)), (np.zeros((1, 3)), np.zeros((1, 3, 3)))
+    return ((find_conditionings, *records, *poses, np.zeros(LEGS), 0, 0, np.zeros(1), 0, 1),)
+
+
 @kernel
 def find_conditionings(
     parameters: Record, pose: Record, rig: Record, positions: Array, rotations: Array, leg_used: Array, platform_used: int,

@@ -19,7 +19,7 @@ from controller.least_squares import (
     solve_nine,
     solve_truncated,
 )
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, shared_kernel
 from plant.mechanism import LEGS
 from plant.pose import Array
 from plant.vectors import Vector, add, cross, dot, scale, subtract, vector
@@ -38,7 +38,7 @@ _MOST_POLAR_STEPS = 30
 _POLAR_TOLERANCE = 1e-18  # square of the last step; the error left after it is the square of that step
 
 
-@kernel
+@shared_kernel
 def pose_from_legs(
     geometry: Record, directions: Array, measured: Array, position: Array, rotation: Array, scratch: Record
 ) -> float:

@@ -20,7 +20,7 @@ from controller.least_squares import (
     solve_least_squares,
     solve_truncated,
 )
-from plant.compiled import Record, kernel
+from plant.compiled import Record, kernel, shared_kernel
 from plant.mechanism import LEGS
 from plant.mechanism.checks import SAME_JOINT_M
 from plant.pose import Array
@@ -87,7 +87,7 @@ def _meeting_point(origins: Array, directions: Array, selected: Array, point: Ar
     return float(np.sqrt(square))
 
 
-@kernel
+@shared_kernel
 def pose_from_rotation(
     geometry: Record, directions: Array, measured: Array, rotation: Array, position: Array, scratch: Record
 ) -> float:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 QUANTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "max": "max"}
 """How each quantile is printed, and its name in the figures."""
 
-_COMPILED_FUNCTIONS = 525
+_COMPILED_FUNCTIONS = 555
 """About how many functions numba compiles for the first simulation on a machine, in two processes."""
 
 _QUIET_S = 10.0

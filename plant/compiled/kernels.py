@@ -146,10 +146,11 @@ def shared_kernel(function: F) -> F:
 def _cached(function: Callable[..., Any]) -> Any:
     """Numba's dispatcher, with the cache in our folder."""
     settings: Any = numba.config
+    njit: Any = numba.njit
     before = settings.CACHE_LOCATOR_CLASSES
     settings.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__}"
     try:
-        compiled: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        compiled: Any = njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
     finally:
         settings.CACHE_LOCATOR_CLASSES = before
     return compiled

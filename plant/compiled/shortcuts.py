@@ -7,11 +7,13 @@ from contextlib import contextmanager, nullcontext
 from functools import cache
 from typing import Any, cast
 
-from numba.core import event
+from numba.core import errors, event
+from numba.core.cpu import CPUContext
 from numba.core.ir import Inst, Var
 from numba.core.targetconfig import ConfigStack
 from numba.core.types import Record
 from numba.core.types.functions import BaseFunction
+from numba.core.untyped_passes import InlineClosureLikes
 from numba.extending import register_jitable
 from numba.np import arrayobj
 
@@ -19,6 +21,9 @@ _LAZY_COLLECTION = (50_000, 20, 20)
 """Collecting the many small objects as often as usual would take a third of the time."""
 
 _resolve: Any = BaseFunction.get_call_type
+_refresh: Any = CPUContext.refresh
+_inline_closures: Any = InlineClosureLikes.run_pass
+_Colours: Any = type(cast(Any, errors).termcolor())
 
 
 @contextmanager
@@ -71,13 +76,36 @@ def _variables(self: Any, value: Any) -> list[Any]:
         value = (value,)
     found: list[Any] = []
     for each in value:
-        if isinstance(each, Var):
+        kind: Any = type(each)
+        if kind is Var:
             found.append(each)
-        elif isinstance(each, Inst):
-            found.extend(each.list_vars())  # type: ignore[no-untyped-call]
-        elif isinstance(each, dict | list | tuple):
-            found.extend(_variables(self, each))
+        elif _may_hold_variables(kind):
+            found.extend(each.list_vars() if issubclass(kind, Inst) else _variables(self, each))
     return found
+
+
+@cache
+def _may_hold_variables(kind: type) -> bool:
+    return issubclass(kind, Inst | dict | list | tuple)
+
+
+def _refresh_if_needed(self: Any) -> None:
+    """As `refresh`, which installs some twenty registries again for each function."""
+    if self.__dict__.get("_gough_registered") != _registered(self):
+        _refresh(self)
+        self._gough_registered = _registered(self)
+
+
+def _registered(context: Any) -> int:
+    """How much the registries hold that are installed in a context and in its typing context."""
+    loaders = {**context._registries, **context.typing_context._registries}
+    return sum(len(getattr(registry, items)) for registry, loader in loaders.items() for items in loader.registry_items)
+
+
+def _inline_closures_if_any(self: Any, state: Any) -> bool:
+    """As `run_pass`, which analyses a function also where it defines no other one."""
+    made = (each for block in state.func_ir.blocks.values() for each in block.find_exprs("make_function"))
+    return next(made, None) is not None and bool(_inline_closures(self, state))
 
 
 @register_jitable
@@ -92,6 +120,10 @@ _SHORTCUTS: tuple[tuple[Any, str, Any], ...] = (
     # It is written for each of some 30 passes.
     (Record, "__repr__", cache(Record.__repr__)),
     (Inst, "_rec_list_vars", _variables),
+    (InlineClosureLikes, "run_pass", _inline_closures_if_any),
+    (CPUContext, "refresh", _refresh_if_needed),
+    # With colorama, the texts of errors are coloured that numba raises and catches itself, a hundred for each function.
+    *(((_Colours, "_markup", lambda self, text, *style: text),) if hasattr(_Colours, "_markup") else ()),
     (arrayobj, "raise_with_shape_context", _refuse_shape),
     # The timers of each function that is being compiled are called at each of LLVM's functions.
     (event, "install_timer", lambda kind, callback: nullcontext()),

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 import pytest
 from numba.core.compiler import run_frontend
+from numba.extending import lower_builtin, type_callable
 
 from controller.cycle import run_stages
 from controller.estimation.integrity.stage import step_integrity
@@ -86,6 +87,29 @@ def test_numba_is_as_ever_when_nothing_compiles() -> None:
         assert all(getattr(owner, name) is shortcut for owner, name, shortcut in shortcuts._SHORTCUTS)
         raise InterruptedError
     assert [getattr(owner, name) for owner, name, _ in shortcuts._SHORTCUTS] == before
+
+
+@kernel
+def _with_a_function_of_its_own(a: float) -> float:
+    def more(b: float) -> float:
+        return a + b
+
+    return more(2.0)
+
+
+def test_a_kernel_may_define_a_function_of_its_own() -> None:
+    assert _with_a_function_of_its_own(3.0) == 5.0
+
+
+def test_what_numba_learns_while_kernels_compile_serves_the_next() -> None:
+    def learned(a: float) -> float:
+        raise NotImplementedError
+
+    with flat_linking():
+        assert numba.njit(lambda a: 2.0 * a)(3.0) == 6.0
+        type_callable(learned)(lambda context: lambda a: numba.float64)
+        lower_builtin(learned, numba.float64)(lambda context, builder, signature, values: builder.fadd(*2 * values))
+        assert numba.njit(lambda a: learned(a))(3.0) == 6.0
 
 
 @pytest.mark.parametrize("function", [run_stages, step_integrity, _ratio])
