@@ -13,7 +13,7 @@ from controller.estimation.pose_estimator import PARAMETERS, STATE, WORST_CONDIT
 from controller.inverse_kinematics import inverse_kinematics, legs_at, sample_workspace
 from controller.rig import RIG, field_of
 from controller.settings import FusionSettings
-from plant.compiled import Record, filled, kernel
+from plant.compiled import Record, filled, kernel, load_kernels
 from plant.dynamics.variables import TINY
 from plant.encoders import EncoderModel
 from plant.errors import InputError
@@ -102,6 +102,7 @@ def check_imus(
     positions, rotations = sample_workspace(mechanism, _POSES, seed=0)
     if not mechanism.planar:
         _check_joints(mechanism, positions, rotations, imus)
+    _load_conditionings()
     worst = float(conditionings(mechanism, positions, rotations, imus, magnetometer, section_5).min())
     if worst >= WORST_CONDITIONING:
         return worst
@@ -337,10 +338,10 @@ def conditionings(
     return found
 
 
-def kernels_of_conditionings() -> tuple[tuple[Any, ...], ...]:
-    """The kernel of `conditionings`, with arguments, as `load_kernels` takes it."""
+def _load_conditionings() -> None:
+    """Load the machine code of `conditionings`, or compile it on all cores."""
     records, poses = (np.zeros((), dtype) for dtype in (PARAMETERS, STATE, RIG)), (np.zeros((1, 3)), np.zeros((1, 3, 3)))
-    return ((find_conditionings, *records, *poses, np.zeros(LEGS), 0, 0, np.zeros(1), 0, 1),)
+    load_kernels((find_conditionings, *records, *poses, np.zeros(LEGS), 0, 0, np.zeros(1), 0, 1))
 
 
 @kernel

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.imu_set import conditionings, kernels_of_conditionings
+from controller.imu_set import conditionings
 from controller.inverse_kinematics import jacobian_at, legs_at
 from controller.least_squares import determinant, extreme_singular_values
 from controller.load_feed_forward import STATE, find_static_forces, own_weight
@@ -139,12 +139,11 @@ def margins(
 
 
 def kernels_of_margins(mechanism: Mechanism) -> tuple[tuple[Any, ...], ...]:
-    """The kernels of `margins`, with arguments each, as `load_kernels` takes them."""
+    """The kernels of `margins`, with arguments each, as `load_kernels` takes them; without that of the conditioning."""
     poses = np.zeros((1, 3)), np.zeros((1, 3, 3))
     return (
         (margin_rows, space_of(mechanism, USUAL), np.zeros((), WORK), *poses, np.zeros((1, COUNT)), 0, 1),
         (first_that_is_none, *poses),
-        *kernels_of_conditionings(),
     )
 
 

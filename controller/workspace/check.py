@@ -177,9 +177,7 @@ class TargetCheck:
 
 
 def load_check(mechanism: Mechanism) -> None:
-    """Load the machine code of `check_against_limits` and of `check_imus` beforehand; what is not in the cache is compiled on
-    all cores.
-    """
+    """Load the machine code of `check_against_limits` beforehand; what is not in the cache is compiled on all cores."""
     lengths = lengths_along, np.zeros((mechanism.legs, 1, 5)), np.zeros(1), np.zeros((1, mechanism.legs))
     load_kernels(*kernels_of_margins(mechanism), *kernels_of_plan(), *kernels_of_lengths(mechanism), lengths)
 

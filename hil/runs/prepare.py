@@ -141,7 +141,6 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
         drives = drive_settings(mechanism, are_few(mechanism, config.imus))
         if config.raw_imus:
             safety, drives = safety.for_raw_imus(), drives.for_raw_imus()
-        load_check(mechanism)
         parameters = cycle_parameters(
             mechanism, config.rate, control, fusion, config.imus, FUSIONS[config.fusion], calibration, config.magnetometer,
             config.fusion == "section-5", safety, drives, 0.0 if config.rig == "fmu" else period,
@@ -164,6 +163,8 @@ def prepared_loop(config: SimulationConfig, records: Record | None = None, in_py
         if config.open_loop:
             parameters["pid"]["gains"] = 0.0
             watch_drives_alone(parameters)
+        if not config.streamed:
+            load_check(mechanism)
         # Loads the planner, so that the planning time is that of the plan alone.
         plan(mechanism, load_target("hold", mechanism, 0.1), 0.1)
         planning_time = 0.0

@@ -59,11 +59,13 @@ def _origin(kernel: Any, types: tuple[Any, ...]) -> Origin:
 
 
 def _is_cached(kernel: Any, types: tuple[Any, ...]) -> bool:
+    if types in kernel.overloads:
+        return True
     cache = kernel._cache
     target: Any = cpu_target.target_context
     # What each worker would have to prepare is prepared once.
     target.refresh()
-    return types in kernel.overloads or cache._index_key(types, target.codegen()) in cache._cache_file._load_index()
+    return cache._index_key(types, target.codegen()) in cache._cache_file._load_index()
 
 
 class _Worker(NamedTuple):

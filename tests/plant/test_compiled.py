@@ -255,9 +255,11 @@ def test_machine_code_is_kept_in_the_cache_alone(tmp_path: Path) -> None:
 def test_machine_code_that_calls_other_kernels_is_loaded_whole(tmp_path: Path) -> None:
     """The callees have no machine code of their own in the cache; the next process finds them in their caller's."""
     code = (
-        "from plant.mechanism import load_mechanism; from controller.cycle import check_imus;"
+        "import os; os.sched_setaffinity(0, [min(os.sched_getaffinity(0))]);"
+        "from plant.mechanism import load_mechanism; from controller.imu_set import check_imus, find_conditionings;"
         "from controller.estimation.pose_estimator import find_pose;"
-        "print(check_imus(load_mechanism('hexapod'), range(7)), sum(find_pose.stats.cache_misses.values()))"
+        "print(check_imus(load_mechanism('hexapod'), range(7)), sum(find_pose.stats.cache_misses.values()));"
+        "assert len(find_conditionings.overloads) == 1, 'not loaded for the types of the call'"
     )
     said = [
         subprocess.run(

@@ -268,7 +268,6 @@ def test_a_check_after_its_machine_code_was_loaded_compiles_none_of_it_for_other
     code = f"""
 import pickle
 from controller.direct_kinematics import lengths
-from controller.imu_set import find_conditionings
 from controller.planning import offline_planner, segments
 from controller.planning.target import load_target
 from controller.pose_limits.margins import first_that_is_none, margin_rows
@@ -276,7 +275,7 @@ from controller.workspace import check_against_limits, load_check
 from plant.mechanism import load_in_space
 
 kernels = (
-    margin_rows, first_that_is_none, find_conditionings, lengths._find_poses, segments.lengths_along,
+    margin_rows, first_that_is_none, lengths._find_poses, segments.lengths_along,
     offline_planner._stops_inside, offline_planner._collect_segments, offline_planner._count_violations,
 )
 mechanism = load_in_space({name!r})
