@@ -339,7 +339,7 @@ def conditionings(
 
 
 def _load_conditionings() -> None:
-    """Load the machine code of `conditionings`, or compile it on all cores."""
+    """Load the machine code of `conditionings`, or compile it in several processes."""
     records, poses = (np.zeros((), dtype) for dtype in (PARAMETERS, STATE, RIG)), (np.zeros((1, 3)), np.zeros((1, 3, 3)))
     load_kernels((find_conditionings, *records, *poses, np.zeros(LEGS), 0, 0, np.zeros(1), 0, 1))
 

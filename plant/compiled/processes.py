@@ -23,6 +23,7 @@ from numba.core.registry import cpu_target
 
 from plant.compiled.linking import Origin
 from plant.compiled.shared import shared_kernels_declared
+from plant.threads import cores
 
 MOST_WORKERS = 4
 """More would wait for the largest kernels."""
@@ -45,13 +46,14 @@ def load_kernels(*calls: tuple[Any, ...]) -> None:
     type_of: Any = typeof
     typed = [(kernel, tuple(type_of(each) for each in arguments)) for kernel, *arguments in calls]
     missing = [_origin(kernel, types) for kernel, types in typed if not _is_cached(kernel, types)]
-    workers = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+    workers = min(cores(), MOST_WORKERS)
     # A study's workers compile in threads, and there is one for each processor already.
     if missing and workers > 1 and threading.current_thread() is threading.main_thread():
         with suppress(Exception), _workers() as started:
             _compile(missing, started, workers)
     for kernel, types in typed:
-        kernel.compile(types)
+        if types not in kernel.overloads:
+            kernel.compile(types)
 
 
 def _origin(kernel: Any, types: tuple[Any, ...]) -> Origin:

@@ -90,22 +90,25 @@ def _may_hold_variables(kind: type) -> bool:
 
 
 def _refresh_if_needed(self: Any) -> None:
-    """As `refresh`, which installs some twenty registries again for each function."""
-    if self.__dict__.get("_gough_registered") != _registered(self):
+    """Refresh only if a registry has grown since; numba installs some twenty of them again for each function."""
+    registered = _registered(self)
+    if self.__dict__.get("_gough_registered") != registered:
         _refresh(self)
-        self._gough_registered = _registered(self)
+        # The number from before: what is registered during a refresh needs another one.
+        self._gough_registered = registered
 
 
 def _registered(context: Any) -> int:
-    """How much the registries hold that are installed in a context and in its typing context."""
+    """The number of items in the registries that are installed in a context and in its typing context."""
     loaders = {**context._registries, **context.typing_context._registries}
     return sum(len(getattr(registry, items)) for registry, loader in loaders.items() for items in loader.registry_items)
 
 
 def _inline_closures_if_any(self: Any, state: Any) -> bool:
-    """As `run_pass`, which analyses a function also where it defines no other one."""
-    made = (each for block in state.func_ir.blocks.values() for each in block.find_exprs("make_function"))
-    return next(made, None) is not None and bool(_inline_closures(self, state))
+    """Run the pass only on a function that defines another one inside, or makes a list, as comprehensions do."""
+    blocks = state.func_ir.blocks.values()
+    any_made = any(True for block in blocks for made in ("make_function", "build_list") for _ in block.find_exprs(made))
+    return any_made and bool(_inline_closures(self, state))
 
 
 @register_jitable
@@ -122,7 +125,7 @@ _SHORTCUTS: tuple[tuple[Any, str, Any], ...] = (
     (Inst, "_rec_list_vars", _variables),
     (InlineClosureLikes, "run_pass", _inline_closures_if_any),
     (CPUContext, "refresh", _refresh_if_needed),
-    # With colorama, the texts of errors are coloured that numba raises and catches itself, a hundred for each function.
+    # With colorama, numba colours the text of every error, also of the hundred per function that it raises and catches itself.
     *(((_Colours, "_markup", lambda self, text, *style: text),) if hasattr(_Colours, "_markup") else ()),
     (arrayobj, "raise_with_shape_context", _refuse_shape),
     # The timers of each function that is being compiled are called at each of LLVM's functions.
