@@ -1,5 +1,7 @@
 """The report of an optimisation: what its page draws, for one objective and for several."""
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -39,6 +41,9 @@ def result_of(objectives, tmp_path):
     ids=len,
 )
 def test_every_figure_is_there(objectives, tmp_path, recwarn):
+    # Files that earlier tests left open are told when they are collected.
+    gc.collect()
+    recwarn.clear()
     result = result_of(objectives, tmp_path)
     path = tmp_path / "page" / "report.html"
     path.parent.mkdir()
