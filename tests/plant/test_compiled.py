@@ -103,7 +103,7 @@ def test_a_kernel_may_define_a_function_of_its_own() -> None:
 
 def test_what_numba_learns_while_kernels_compile_serves_the_next() -> None:
     def learned(a: float) -> float:
-        raise NotImplementedError
+        return a + a
 
     with flat_linking():
         assert numba.njit(lambda a: 2.0 * a)(3.0) == 6.0
