@@ -142,6 +142,30 @@ def options_of(config: "type[C]", *names: str, only_given: bool = False, **chang
     return add
 
 
+def seed_options(text: str) -> Argument:
+    """Options for how many seeds there are, and which is the first; `seeds_of` reads them."""
+    both = setting("--seeds", 20, text), setting("--first-seed", 0, "the first seed; the others follow it")
+
+    def add(parser: ArgumentParser) -> None:
+        for each in both:
+            each(parser)
+
+    return add
+
+
+def seeds_of(options: Namespace) -> range:
+    """The seeds that the user asks for.
+
+    Raises:
+        InputError: there are none, or the first is negative.
+    """
+    if options.seeds < 1:
+        raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
+    if options.first_seed < 0:
+        raise InputError(f"the first seed is {options.first_seed}; it is 0 or more")
+    return range(options.first_seed, options.first_seed + options.seeds)
+
+
 def engine_options(few: str = "") -> Argument:
     """The options of a study's engine; `few` says why it stays in one process unless they ask for more."""
     texts = {each.name: each.metadata["option"].text for each in fields(EngineSettings)}

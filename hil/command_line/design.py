@@ -2,7 +2,7 @@
 
 from argparse import ArgumentTypeError, Namespace
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -378,7 +378,7 @@ def gough_bounds(options: Namespace) -> None:
     cli.options_of(
         SimulationConfig, faults={"text": "instead of rows: what happens, as for 'gough simulate'; several act together"}
     ),
-    cli.setting("--seeds", 20, "how often each row is drawn: its IMUs, signs and times"),
+    cli.seed_options("how often each row is drawn: its IMUs, signs and times"),
     cli.source("--measured", "FILE.json", "figures of 'gough faults --json', to compare"),
     cli.options_of(Uncertainty),
     cli.markdown("docs/detectability.md"),
@@ -397,13 +397,13 @@ def gough_detectability(options: Namespace) -> int:
     5 mm and 1 deg for shared ones; the least share of the fault that would be told in the run, and the error by it; the least
     protection level that covers the error in 99.9 % of the cycles, and how many times the RMS error of a sound estimate it is.
 
-    With --measured, the exit status is 1 if an error until something was told is beyond the limit. Nothing is simulated.
+    A row that is drawn anew by each seed has a line for each. With --measured, the exit status is 1 if an error until
+    something was told is beyond the limit. Nothing is simulated.
     """
     from hil.faults.bounds import bounds_of_rows, left_out, read_figures, summary, table
     from hil.faults.rows import SOUND, Row, all_rows
 
-    if options.seeds < 1:
-        raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
+    seeds = cli.seeds_of(options)
     texts = options.rows or [""]
     asked = [row for row in all_rows() if any(text in row.name or text in row.kind for text in texts)]
     rows = [row for row in asked if row.kind != SOUND]
@@ -424,7 +424,7 @@ def gough_detectability(options: Namespace) -> int:
     measured = read_figures(options.measured) if options.measured else None
     uncertainty = cli.config_of(options, Uncertainty)
     with engine_at_work(cli.engine_of(options), "rows") as (engine, progress):
-        found = bounds_of_rows([replace(row, **given) for row in rows], options.seeds, uncertainty, engine, progress)
+        found = bounds_of_rows([row.with_entries(given) for row in rows], seeds, uncertainty, engine, progress)
     table(found, measured).print(options.markdown)
     cli.write_json(options.json, summary(found, uncertainty, measured))
     for line in left_out(found):

@@ -293,8 +293,7 @@ _EVALUATED: dict[str, Callable[[dict[str, Any]], None]] = {
 
 
 @cli.command(
-    cli.setting("--seeds", 20, "how often each case is tried"),
-    cli.setting("--first-seed", 0, "the first seed; the others follow it"),
+    cli.seed_options("how often each case is tried"),
     cli.argument(
         "--only",
         metavar="TEXT",
@@ -346,10 +345,7 @@ def gough_faults(options: Namespace) -> int:
     )
     from hil.faults.trials import outcomes_of, run_trials, trials_of
 
-    if options.seeds < 1:
-        raise InputError(f"there are {options.seeds} seeds; at least 1 is needed")
-    if options.first_seed < 0:
-        raise InputError(f"the first seed is {options.first_seed}; it is 0 or more")
+    seeds = cli.seeds_of(options)
     fusions = tuple(options.fusion.split(","))
     for fusion in fusions:
         SimulationConfig(fusion=fusion, lengths=options.lengths)
@@ -367,7 +363,7 @@ def gough_faults(options: Namespace) -> int:
     if options.results is not None:
         check_installed("pyarrow")
     with engine_at_work(cli.engine_of(options), "faults") as (engine, progress):
-        trials = trials_of(items, options.seeds, fusions, options.first_seed)
+        trials = trials_of(items, seeds, fusions)
         found = run_trials(trials, engine, progress, options.results)
     cases = [item for item in items if isinstance(item, Case)]
     outcomes, disturbances = outcomes_of(cases, found), disturbances_of(found)
@@ -381,7 +377,7 @@ def gough_faults(options: Namespace) -> int:
     sound = sound_of(found)
     if sound:
         sound_table(sound).print(options.markdown)
-    cli.write_json(options.json, summary(outcomes, disturbances, sound, options.seeds, options.first_seed))
+    cli.write_json(options.json, summary(outcomes, disturbances, sound, seeds))
     findings = [finding for outcome in outcomes for finding in outcome.findings]
     for finding in findings:
         print(finding, file=sys.stderr)

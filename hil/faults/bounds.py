@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from math import degrees, inf, radians
 from pathlib import Path
@@ -46,12 +46,26 @@ best test is below it [m], [rad].
 
 @dataclass(frozen=True)
 class RowBounds:
-    """A row with its bounds, one for each seed, or the reason why there are none."""
+    """A row with its bounds, one for each seed, or the reason why there are none.
+
+    Attributes:
+        row: the disturbance.
+        single: whether few IMUs have it.
+        bounds: of the seeds.
+        reason: why there are none.
+        seed: the only one, where each draws another disturbance; None otherwise.
+    """
 
     row: Row
     single: bool
     bounds: tuple[Bound, ...] = ()
     reason: str = ""
+    seed: int | None = None
+
+    @property
+    def name(self) -> str:
+        """That of the row, with the seed if this is the only one."""
+        return self.row.name if self.seed is None else f"{self.row.name}, seed {self.seed}"
 
     def greatest(self, figure: str) -> float:
         """The greatest of a figure over the seeds."""
@@ -77,46 +91,70 @@ class RowBounds:
 
     def beyond(self, measured: Mapping[str, Any]) -> bool:
         """Whether an error in the figures of `gough faults --json` is beyond the limit."""
-        return bool(self.bounds) and "no" in map(self.verdict, errors_before(self.row, measured).values())
+        return bool(self.bounds) and "no" in map(self.verdict, self.before(measured).values())
+
+    def before(self, measured: Mapping[str, Any]) -> dict[str, Errors]:
+        """By fusion, the greatest errors until something was told, in the figures of `gough faults --json`.
+
+        Raises:
+            InputError: these are other figures.
+        """
+        try:
+            rows = [each for each in measured["disturbances"] if each["row"] == self.row.name]
+            if self.seed is None:
+                return {each["fusion"]: _errors_before(each) for each in rows}
+            seeds = {each["fusion"]: {own["seed"]: own for own in each["seeds"]} for each in rows}
+            return {fusion: _errors_before(own[self.seed]) for fusion, own in seeds.items() if self.seed in own}
+        except (KeyError, TypeError, ValueError):
+            raise InputError(
+                "these are no figures of disturbances: take those that 'gough faults --json FILE' has written"
+            ) from None
 
     def summary(self, measured: Mapping[str, Any] | None) -> dict[str, Any]:
         """The figures in SI units, for JSON, with those of `gough faults --json` if there are any."""
-        found = {"row": self.row.name, "kind": self.row.kind, "single": self.single, "reason": self.reason or None}
+        found = {"row": self.name, "kind": self.row.kind, "single": self.single, "reason": self.reason or None}
         if not self.bounds:
             return found
         found |= {"strict": self.strict._asdict(), "limit": self.limit._asdict(), "seeds": [vars(each) for each in self.bounds]}
         if measured:
-            before = errors_before(self.row, measured)
+            before = self.before(measured)
             found["measured"] = {name: {**each._asdict(), "within": self.verdict(each)} for name, each in before.items()}
         return found
 
 
+def _errors_before(figures: Mapping[str, Any]) -> Errors:
+    # Infinite errors have no number in JSON.
+    sizes = (inf if size is None else float(size) for size in (figures["position_before"], figures["rotation_before"]))
+    return Errors(*sizes)
+
+
 def bounds_of_rows(
     rows: Sequence[Row],
-    seeds: int,
+    seeds: Sequence[int],
     uncertainty: Uncertainty | None = None,
     engine: Engine = IN_ONE_PROCESS,
     progress: Progress = no_progress,
 ) -> list[RowBounds]:
-    """The bounds of rows, each as so many seeds draw it.
+    """The bounds of rows as seeds draw them: of each row those of all seeds together, or one by one where each draws another
+    disturbance.
 
     Raises:
         GoughError: a mechanism, a target or a kind of IMU cannot be used.
     """
-    return engine.starmap(_bounds_of, [(row, seeds, uncertainty or Uncertainty()) for row in rows], progress)
+    items = [(row, own) for row in rows for own in ([(seed,) for seed in seeds] if row.draw else [tuple(seeds)])]
+    return engine.starmap(_bounds_of, [(*item, uncertainty or Uncertainty()) for item in items], progress)
 
 
-def _bounds_of(row: Row, seeds: int, uncertainty: Uncertainty) -> RowBounds:
-    drawn = [row.drawn(seed, "whole") for seed in range(seeds)]
+def _bounds_of(row: Row, seeds: Sequence[int], uncertainty: Uncertainty) -> RowBounds:
+    drawn = [row.drawn(seed, "whole") for seed in seeds]
+    found = RowBounds(row, bool(drawn[0].guilty), seed=seeds[0] if row.draw else None)
     if row.base_imu or row.lengths != NO_LENGTHS:
-        return RowBounds(row, bool(drawn[0].guilty), reason="the test has neither lengths nor an IMU on the base")
-    if row.draw:
-        return RowBounds(row, bool(drawn[0].guilty), reason="every seed draws another disturbance")
+        return replace(found, reason="the test has neither lengths nor an IMU on the base")
     try:
         bounds = find_bounds([Disturbed(each.config, each.faults, each.begin) for each in drawn], uncertainty)
     except NoSignatureError as error:
-        return RowBounds(row, bool(drawn[0].guilty), reason=str(error))
-    return RowBounds(row, bool(drawn[0].guilty), tuple(bounds))
+        return replace(found, reason=str(error))
+    return replace(found, bounds=tuple(bounds))
 
 
 def summary(found: Sequence[RowBounds], uncertainty: Uncertainty, measured: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -140,26 +178,6 @@ def read_figures(path: Path) -> dict[str, Any]:
     return figures
 
 
-def errors_before(row: Row, measured: Mapping[str, Any]) -> dict[str, Errors]:
-    """By fusion, the greatest errors of a row until something was told, in the figures of `gough faults --json`.
-
-    Raises:
-        InputError: these are other figures.
-    """
-    try:
-        rows = [each for each in measured["disturbances"] if each["row"] == row.name]
-        # Infinite errors have no number in JSON.
-        sizes = [
-            [inf if size is None else float(size) for size in (each["position_before"], each["rotation_before"])]
-            for each in rows
-        ]
-        return {each["fusion"]: Errors(*size) for each, size in zip(rows, sizes, strict=True)}
-    except (KeyError, TypeError, ValueError):
-        raise InputError(
-            "these are no figures of disturbances: take those that 'gough faults --json FILE' has written"
-        ) from None
-
-
 def table(found: Sequence[RowBounds], measured: Mapping[str, Any] | None = None) -> Table:
     """The bounds of rows that have some: errors in mm and deg, the greatest over the seeds.
 
@@ -174,12 +192,12 @@ def table(found: Sequence[RowBounds], measured: Mapping[str, Any] | None = None)
         times = [bound.told_after for bound in each.bounds]
         when = "never" if None in times else f"{max(time for time in times if time is not None):.2f}"
         errors = map(str, (each.errors(), each.errors("fault_"), each.strict, each.limit))
-        cells: list[str | Cell] = [each.row.name, when, f"{100.0 * each.greatest('share'):.0f} %", *errors]
+        cells: list[str | Cell] = [each.name, when, f"{100.0 * each.greatest('share'):.0f} %", *errors]
         cells += [f"{100.0 * each.greatest('least'):.3g} %", str(each.errors("least_"))]
         level, sound = each.errors("level_"), each.errors("sound_")
         cells += [str(level), f"{level.position / sound.position:.1f}/{level.rotation / sound.rotation:.1f}"]
         if measured:
-            before = errors_before(each.row, measured).values()
+            before = each.before(measured).values()
             verdicts = [each.verdict(errors) for errors in before]
             cells += ["; ".join(map(str, before)) or "-", Cell(" / ".join(verdicts) or "-", alarm="no" in verdicts)]
         result.add(*cells)
@@ -188,4 +206,4 @@ def table(found: Sequence[RowBounds], measured: Mapping[str, Any] | None = None)
 
 def left_out(found: Sequence[RowBounds]) -> list[str]:
     """The rows without bounds and the reason, a line each."""
-    return [f"{each.row.name}: {each.reason}" for each in found if each.reason]
+    return [f"{each.name}: {each.reason}" for each in found if each.reason]

@@ -83,6 +83,11 @@ class Row:
     sizes: tuple[float, ...] = ()
     draw: Mapping[str, Sequence[Any]] = field(default_factory=dict, hash=False)
 
+    def with_entries(self, entries: Mapping[str, Any]) -> "Row":
+        """The row with other entries, which then no seed draws; what it draws else stays the same."""
+        draw = {name: [entries[name]] * len(choices) if name in entries else choices for name, choices in self.draw.items()}
+        return replace(self, **entries, draw=draw)
+
     def drawn(self, seed: int, fusion: str) -> "Drawn":
         """What a seed makes of the row: IMUs, place, sign and time, and what else it draws."""
         random = np.random.default_rng([seed, crc32(self.name.encode())])

@@ -23,18 +23,20 @@ _GREATEST = (
     "level_position", "level_rotation", "told_s", "encoder_off",
 )  # fmt: skip
 """Of these figures the greatest over the seeds is shown; a table has no column for what no run has."""
+_OF_SEEDS = ("seed", "what", "position_before", "rotation_before")
+"""These figures of each seed are in the summary, too."""
 
 
 def summary(
-    outcomes: list[Outcome], disturbances: list[dict[str, Any]], sound: list[dict[str, Any]], seeds: int, first_seed: int = 0
+    outcomes: list[Outcome], disturbances: list[dict[str, Any]], sound: list[dict[str, Any]], seeds: Sequence[int]
 ) -> dict[str, Any]:
     """Everything, for JSON, in SI units; what is not finite is null."""
     return {
         "cases": [each.summary() for each in outcomes],
         "disturbances": _finite(disturbances),
         "sound": _finite(sound),
-        "seeds": seeds,
-        "first_seed": first_seed,
+        "seeds": len(seeds),
+        "first_seed": seeds[0],
         "rate_hz": RATE_HZ,
         "version": version("gough"),
     }
@@ -42,6 +44,8 @@ def summary(
 
 def _finite(figures: list[dict[str, Any]]) -> list[dict[str, Any]]:
     def or_none(value: Any) -> Any:
+        if isinstance(value, list):
+            return _finite(value)
         return None if isinstance(value, float) and not isfinite(value) else value
 
     return [{name: or_none(value) for name, value in each.items()} for each in figures]
@@ -53,8 +57,8 @@ def disturbances_of(found: Iterable[Figures]) -> list[dict[str, Any]]:
     Returns:
         By row and fusion: the greatest of each error, level and time (`verdict.judge`), how often what was `told` first, how
         often and why the run `ended` early, the numbers of `runs`, of those with `alarms` before the begin, of `forbidden`
-        ones, and of those that named an encoder too `late`, and the share of cycles that the protection level has `covered`, if
-        there is one.
+        ones, and of those that named an encoder too `late`, the share of cycles that the protection level has `covered`, if
+        there is one, and of each of the `seeds`, `what` it has drawn and its errors before anything was told.
     """
     groups: dict[tuple[str, str, str], list[Figures]] = {}
     for figures in found:
@@ -76,6 +80,7 @@ def _over_seeds(runs: list[Figures]) -> dict[str, Any]:
         "forbidden": sum(each["forbidden"] for each in runs),
         "late": sum(map(_is_late, runs)),
         "covered": float(np.divide(*np.sum(covered, axis=0))) if covered else None,
+        "seeds": [{name: each[name] for name in _OF_SEEDS} for each in runs],
     }
 
 

@@ -55,13 +55,13 @@ class Trial:
         return {"kind": self.what.kind, "row": self.what.name, "fusion": self.fusion, "seed": self.seed}
 
 
-def trials_of(items: Iterable[Case | Row], seeds: int, fusions: Sequence[str] = FUSIONS, first: int = 0) -> list[Trial]:
-    """The trials of cases and rows with so many seeds, from the first one on."""
+def trials_of(items: Iterable[Case | Row], seeds: Sequence[int], fusions: Sequence[str] = FUSIONS) -> list[Trial]:
+    """The trials of cases and rows with each seed."""
     return [
         Trial(item, seed, fusion)
         for item in items
         for fusion in (fusions if isinstance(item, Row) or item.lengths != NO_LENGTHS else FUSIONS[:1])
-        for seed in range(first, first + seeds)
+        for seed in seeds
     ]
 
 

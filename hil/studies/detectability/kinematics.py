@@ -14,10 +14,12 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
+from controller.direct_kinematics.lengths import poses_from_lengths
+from controller.planning.offline_planner import plan
+from controller.planning.segments import lengths_along
 from controller.planning.target import Target
 from plant.compiled import Record
 from plant.dynamics.base_course import base_motions_at
-from plant.errors import InputError
 from plant.mechanism import Mechanism
 from plant.pose import Array
 
@@ -31,6 +33,9 @@ BASE_JET = 9
 """Errors of the base's angular velocity, angular acceleration and specific force."""
 
 _DIFFERENCE_S = 1e-4
+
+_PLANNED_S = 2e-3
+"""Between two poses of a planned motion."""
 
 
 @dataclass(frozen=True)
@@ -104,13 +109,14 @@ class Signals(NamedTuple):
 
 
 def motion_along(target: Target, mechanism: Mechanism, times: Array) -> Motion:
-    """A target's motion at times (N,) [s], through a spline with four continuous derivatives; before 0 it stands at the start.
+    """A target's motion at increasing times (N,) [s], through a spline with four continuous derivatives; before 0 it stands at
+    the start.
 
     Raises:
-        InputError: the target holds its poses, between which only a planner knows the way.
+        GoughError: the target holds its poses, and the loop's planner finds no way between them.
     """
     if target.held:
-        raise InputError(f"the target {target.name!r} jumps from pose to pose; choose one that moves on, such as sines")
+        target = _as_planned(target, mechanism, float(times[-1]))
     home = mechanism.require_home()
     turns = Rotation.from_matrix(target.rotations @ home.rotation.T).as_rotvec()
     spline = make_interp_spline(target.times, np.hstack([target.positions, turns]), k=5)
@@ -135,6 +141,15 @@ def motion_along(target: Target, mechanism: Mechanism, times: Array) -> Motion:
         acceleration(at)[:, :3] * moving,
         hurry * moving,
     )
+
+
+def _as_planned(target: Target, mechanism: Mechanism, end: float) -> Target:
+    """The poses through which the loop's planner goes between those that a target holds, until after `end` [s]."""
+    times = np.arange(0.0, max(end, 0.0) + 6.0 * _PLANNED_S, _PLANNED_S)
+    lengths = np.empty((len(times), mechanism.legs))
+    lengths_along(plan(mechanism, target, float(times[-1])).segments, times, lengths)
+    positions, rotations = poses_from_lengths(mechanism, lengths, target.start)
+    return replace(target, times=times, positions=positions, rotations=rotations, held=False)
 
 
 def base_motion_along(motions: Sequence[Record], mechanism: Mechanism, times: Array) -> BaseMotion:

@@ -1,13 +1,14 @@
 """Rows of disturbances against the best test: figures, verdicts, and the command."""
 
 import json
+from dataclasses import replace
 from math import inf, radians
 
 import numpy as np
 import pytest
 
 from hil.command_line import main
-from hil.faults.bounds import FACTOR, LIMITS, Errors, RowBounds, bounds_of_rows, errors_before, left_out, summary, table
+from hil.faults.bounds import FACTOR, LIMITS, Errors, RowBounds, bounds_of_rows, left_out, summary, table
 from hil.faults.rows import SOUND, Row, all_rows
 from hil.studies.detectability.bounds import Bound
 from hil.studies.detectability.uncertainty import Uncertainty
@@ -41,7 +42,7 @@ def figures(row, *errors):
 def found():
     """The bounds of two rows of the table and one without a signature."""
     rows = [row_of(TILT), row_of("a leg's IMU turns by 3 deg about x at once"), row_of("wind of 30 N")]
-    return bounds_of_rows(rows, 2)
+    return bounds_of_rows(rows, range(2))
 
 
 def test_rows_have_bounds_far_below_the_limits_or_a_reason(found):
@@ -55,7 +56,7 @@ def test_rows_have_bounds_far_below_the_limits_or_a_reason(found):
 
 def test_seeds_draw_other_legs_and_times_and_repeat_to_the_bit(found):
     turn = found[1]
-    again = bounds_of_rows([turn.row], 2)[0]
+    again = bounds_of_rows([turn.row], range(2))[0]
     assert again == turn and turn.bounds[0] != turn.bounds[1]
 
 
@@ -81,7 +82,7 @@ def test_a_fault_that_hides_well_may_do_more_than_the_limit():
 def test_figures_of_runs_stand_beside_the_bounds(found):
     tilt = found[0]
     measured = figures(tilt.row, (0.5e-3, 0.001), (None, 0.002))
-    assert errors_before(tilt.row, measured) == {"compiled": Errors(0.5e-3, 0.001), "whole": Errors(inf, 0.002)}
+    assert tilt.before(measured) == {"compiled": Errors(0.5e-3, 0.001), "whole": Errors(inf, 0.002)}
     assert tilt.beyond(measured) and not tilt.beyond({"disturbances": []})
     cells = [cell.text for cell in table(found, measured).rows[0]]
     assert cells[0] == TILT and cells[-1] == "yes / no" and cells[-2].startswith("0.50/0.06; inf/")
@@ -89,12 +90,12 @@ def test_figures_of_runs_stand_beside_the_bounds(found):
     assert written["compiled"]["within"] == "yes" and written["whole"]["within"] == "no"
     for wrong in ({"disturbances": [{"row": TILT}]}, {"disturbances": [3]}):
         with pytest.raises(InputError, match="gough faults --json"):
-            errors_before(tilt.row, wrong)
+            tilt.before(wrong)
 
 
 def test_a_row_that_is_never_told_says_so():
     row = Row("slow", "own", ("imu-offset:all,axis=x,size_deg_per_s=1e-4,ramp_s=4,at=1",), duration=3.0)
-    found = bounds_of_rows([row], 1)
+    found = bounds_of_rows([row], [0])
     assert found[0].bounds[0].told_after is None and found[0].bounds[0].least > 1.0
     assert table(found).rows[0][1].text == "never"
 
@@ -135,7 +136,6 @@ def test_the_command_takes_a_fault_of_one_s_own_and_other_uncertainties(capsys):
         (["nothing is wrong, 6-5", "nothing is wrong, 6-4"], "or see what the loop tells in these: gough faults --only sound"),
         (["--seeds", "0"], "at least 1 is needed"),
         (["--fault", "imu-offset:9,axis=y,size_m_per_s2=1"], "imus = '9'"),
-        (["--fault", "base-tilt,axis=x,size_deg=1", "--target", "steps"], "choose one that moves on"),
         (["--fault", "base-tilt,axis=x,size_deg=1", "--jerk", "0"], "it must be positive and finite"),
         (["wind", "--measured", __file__], "is no JSON"),
         (["wind", "--measured", "nowhere.json"], "nowhere.json"),
@@ -147,15 +147,31 @@ def test_bad_input_gets_one_line(options, message, capsys):
     assert message in errors[-1] and not any("Traceback" in line for line in errors)
 
 
-def test_a_row_of_which_every_seed_draws_another_disturbance_has_no_bounds():
-    (found,) = bounds_of_rows([row for row in all_rows() if row.name == "drawn: IMUs turn"], 2)
-    assert not found.bounds and found.reason == "every seed draws another disturbance"
+def test_each_seed_of_a_row_that_is_drawn_anew_has_bounds_of_its_own_beside_its_own_errors():
+    row, seeds = row_of("drawn: the base tilts").with_entries({"duration": 6.0, "mechanism": "hexapod"}), range(3, 5)
+    found = bounds_of_rows([row], seeds)
+    assert [each.name for each in found] == [f"{row.name}, seed {seed}" for seed in seeds]
+    assert [len(each.bounds) for each in found] == [1, 1] and found[0].bounds != found[1].bounds
+    measured = figures(row, (0.5e-3, 0.001), (0.5e-3, 0.001))
+    for each in measured["disturbances"]:
+        each["seeds"] = [{"seed": seeds[0], "position_before": 50e-3, "rotation_before": None}]
+    assert found[0].before(measured) == dict.fromkeys(("compiled", "whole"), Errors(50e-3, inf))
+    assert found[0].beyond(measured) and not found[1].before(measured) and not found[1].beyond(measured)
+    assert [row[0].text for row in table(found, measured).rows] == [each.name for each in found]
+
+
+def test_a_row_with_other_entries_draws_the_same_otherwise():
+    row = row_of("drawn: the base tilts")
+    other = row.with_entries({"rate": 500.0})
+    for seed in range(5):
+        own, changed = row.drawn(seed, "whole"), other.drawn(seed, "whole")
+        assert changed.config == replace(own.config, rate=500.0) and changed.faults == own.faults
 
 
 @pytest.mark.endurance
 def test_only_shocks_and_joints_that_are_off_come_near_the_limits_before_they_are_told():
     """All other rows are told before the error exceeds two thirds of the limit."""
-    found = [each for each in bounds_of_rows([row for row in all_rows() if row.kind != SOUND], 2) if each.bounds]
+    found = [each for each in bounds_of_rows([row for row in all_rows() if row.kind != SOUND], range(2)) if each.bounds]
     assert len(found) > 100
     share = [max(np.divide(each.errors(), LIMITS[each.single])) for each in found]
     beyond = {each.row.kind for each, size in zip(found, share, strict=True) if size > 2.0 / 3.0}

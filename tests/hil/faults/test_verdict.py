@@ -128,7 +128,8 @@ def test_an_encoder_is_as_far_off_as_its_reading_changes_otherwise_than_its_leng
     made["length"] = made["truth"][:, 7:13] - 0.3
     made["length"][BEGIN:, 2] -= 1e-5 * np.arange(CYCLES - BEGIN)
     tell(made, 180, Cause.ENCODER_CONTRADICTED, 2)
-    found = {"kind": "encoders", "row": "a", "fusion": "whole", **judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)}
+    of_run = {"kind": "encoders", "row": "a", "fusion": "whole", "seed": 0, "what": "b"}
+    found = {**of_run, **judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)}
     assert found["encoder_off"] == pytest.approx(0.8e-3)
     (each,) = disturbances_of([found])
     assert each["late"] == 0
@@ -191,8 +192,10 @@ def test_an_estimate_that_is_no_number_is_infinitely_far_off_and_null_in_json():
     made["position"][200] = np.nan
     found = judge(made, BEGIN, frozenset(), Cause.END_OF_MOTION, RATE)
     assert found["position_before"] == np.inf
-    (each,) = disturbances_of([{"kind": "x", "row": "a", "fusion": "whole", "seed": 0, **found}])
-    json.dumps(summary([], [each], [], 1), allow_nan=False)
+    (each,) = disturbances_of([{"kind": "x", "row": "a", "fusion": "whole", "seed": 0, "what": "a", **found}])
+    written = summary([], [each], [], [0])
+    json.dumps(written, allow_nan=False)
+    assert written["disturbances"][0]["seeds"][0]["position_before"] is None
     assert disturbance_table([each]).rows[0][1].text == "none"
 
 
@@ -247,24 +250,26 @@ def test_runs_in_which_nothing_is_wrong_are_counted_and_their_errors_taken_toget
     )
     assert sound_table([alone]).rows[0][6].text == "-"
     lost = {**found[0], "rms_position": np.inf, "level_position": np.inf}
-    json.dumps(summary([], [], sound_of([lost]), 1), allow_nan=False)
+    json.dumps(summary([], [], sound_of([lost]), [0]), allow_nan=False)
 
 
 def test_a_row_of_the_table_has_the_greatest_of_all_seeds_and_the_worst_come_first():
     figures = {
-        "kind": "x", "row": "a", "fusion": "whole", "position_before": 1e-3, "rotation_before": 0.01, "position_after": None,
+        "kind": "x", "row": "a", "fusion": "whole", "seed": 0, "what": "c",
+        "position_before": 1e-3, "rotation_before": 0.01, "position_after": None,
         "rotation_after": None, "position_then": None, "rotation_then": None, "deviation": 1e-3, "told": "", "told_s": None,
         "alarms": 0, "ended": "end of the motion", "sound_left_out": "", "forbidden": False,
     }  # fmt: skip
     told = {"told": "the base turns", "told_s": 2.5, "position_before": 4e-3, "position_after": 9e-3, "ended": "the base turns"}
     found = [
-        {**figures, "seed": 0},
+        figures,
         {**figures, **told, "seed": 1},
         {**figures, **told, "seed": 2, "covered": 90, "cycles": 100},
         {**figures, "row": "b", "fusion": "compiled", "forbidden": True, "sound_left_out": "6"},
         {**figures, "row": "b", "position_before": 8e-3},
     ]
     made = disturbances_of([*found, {"kind": "reactions"}])
+    assert made[0]["seeds"][1] == {"seed": 1, "what": "c", "position_before": 4e-3, "rotation_before": 0.01}
     assert [(each["row"], each["fusion"], each["forbidden"]) for each in worst_first(made)] == [
         ("b", "compiled", 1),
         ("b", "whole", 0),

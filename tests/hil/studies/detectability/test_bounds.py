@@ -12,7 +12,7 @@ from hil.studies.detectability.likelihood_ratio import RAISED, needed_noncentral
 from hil.studies.detectability.model import DATA, whitened
 from hil.studies.detectability.signatures import NoSignatureError
 from hil.studies.detectability.uncertainty import Uncertainty
-from plant.errors import InputError, UnknownNameError
+from plant.errors import UnknownNameError
 
 from .conftest import STEP_S, draw
 
@@ -149,10 +149,10 @@ def test_joints_that_are_off_a_little_need_a_higher_level_than_nothing_at_all():
     assert 2.5 < none.level_rotation / none.sound_rotation < 5.0
 
 
-def test_what_has_no_signature_or_cannot_be_linearised_is_refused():
+def test_what_has_no_signature_is_refused():
     with pytest.raises(NoSignatureError):
         bounds_of("imu-noise:all,axis=all,size_g=0.1,at=1.5")
-    with pytest.raises(InputError, match="choose one that moves on"):
-        find_bounds([Disturbed(SimulationConfig(target="steps"), ("base-tilt,axis=x,size_deg=1",), 0.0)], Uncertainty())
+    with pytest.raises(NoSignatureError):
+        find_bounds([Disturbed(SimulationConfig(target="hold"), ("imu-stuck:6,sensor=gyroscope,axis=x",), 1.0)], Uncertainty())
     with pytest.raises(UnknownNameError):
         find_bounds([Disturbed(SimulationConfig(imu="ideall"), ("base-tilt,axis=x,size_deg=1",), 0.0)], Uncertainty())

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from controller.planning.offline_planner import plan
+from controller.planning.segments import evaluate_reference
 from controller.planning.target import load_target
 from hil.studies.detectability.kinematics import (
     JET,
@@ -17,7 +19,6 @@ from hil.studies.detectability.kinematics import (
     signals,
 )
 from plant.dynamics.base_course import attitudes_of, base_motion_of_text
-from plant.errors import InputError
 from plant.mechanism import load_spatial
 from plant.pose import rotation_from_vector
 
@@ -206,7 +207,15 @@ def test_a_motion_has_the_derivatives_of_its_target_and_stands_before_it_begins(
     np.testing.assert_allclose(spin[moving][:, [2, 0, 1], [1, 2, 0]], motion.angular_velocity[moving], atol=2e-6)
 
 
-def test_a_target_that_jumps_is_refused():
+def test_between_held_poses_the_legs_move_as_the_loop_plans():
     mechanism = load_spatial("hexapod")
-    with pytest.raises(InputError, match="choose one that moves on"):
-        motion_along(load_target("steps", mechanism, 4.0), mechanism, np.arange(3.0))
+    target, times = load_target("steps", mechanism, 4.0), np.arange(-0.5, 4.0, 1e-3)
+    found = signals(mechanism, motion_along(target, mechanism, times))
+    planned, index, state = plan(mechanism, target, 4.0), np.zeros(6, np.int64), np.zeros((6, 3))
+    rates = []
+    for i, time in enumerate(times):
+        evaluate_reference(planned.segments, max(time, 0.0), index, state)
+        np.testing.assert_allclose(found.lengths[i], state[:, 0], atol=2e-7)
+        rates.append(state[:, 1].copy())
+    np.testing.assert_allclose(found.leg_rates, rates, atol=2e-4)
+    assert np.abs(rates).max() > 0.05

@@ -79,7 +79,6 @@ def test_the_command_prints_and_writes(tmp_path, capsys):
     [
         (["--imus", "0,1,2,3", "--magnetometer"], "add IMU 6"),
         (["--mechanism", "planar-3rpr", "--magnetometer"], "of a mechanism in space"),
-        (["--target", "steps"], "choose one that moves on"),
         (["--measured", "--seeds", "0"], "at least 1 is needed"),
         (["--measured", "--calibration", "none.toml"], "none.toml"),
         (["--lengths", "none.toml"], "none.toml"),
