@@ -372,7 +372,8 @@ def run_stages(
         if s.pose.found != 0 and p.encoders.lead == 0:
             s.pose.found = pose_estimator.refine_pose(p.pose, s.pose, rig, time, s.legs, s.platform.rate)
             if s.pose.found != 0 and p.pose.section_5 == 0:
-                watch.check_misfit(p.safety, s.safety, rig, time, s.pose, s.reference, s.pid)
+                moved = s.integrity.commanded.moved[0]
+                watch.check_misfit(p.safety, s.safety, rig, time, s.pose, moved, s.reference, s.pid)
             if s.pose.found != 0 and p.pose.section_5 == 0 and p.encoders.count > 0:
                 encoders.compare_lengths(p.encoders, s.encoders, rig, s.pose)
                 if encoder_watch.judge_encoders(

@@ -23,6 +23,9 @@ _LEAST_CYCLES = 10
 _UNFIT_S = 0.005
 """For how long the misfit must be beyond its limit, at least two cycles [s]."""
 
+_MOVED_M = 1.3e-3
+"""If the estimate has moved so far otherwise than commanded, the limit of the misfit is reduced: to half at twice as far."""
+
 _UNJUDGED_S = 1.0
 """After what time without an evaluation of the evidence that is told [s]."""
 
@@ -159,9 +162,18 @@ def update_rig_status(
 
 
 @kernel
-def check_misfit(p: Record, s: Record, rig: Record, time: Record, pose: Record, reference: Record, pid: Record) -> None:
-    """After the refinement: stop when no pose fits the directions that the IMUs tell, whichever of them is left out."""
+def check_misfit(
+    p: Record, s: Record, rig: Record, time: Record, pose: Record, moved: float, reference: Record, pid: Record
+) -> None:  # fmt: skip
+    """After the refinement: stop when no pose fits the directions that the IMUs tell, whichever of them is left out.
+
+    Args:
+        moved: how far the position has moved otherwise than commanded [m], which no sensor measures. An error that IMUs share
+            shows itself in both, long before one of them alone is certain.
+    """
     misfit, limit = pose.rest_misfit, p.watch.misfit
+    if moved > _MOVED_M:
+        limit *= (_MOVED_M / moved) ** 2
     s.watch.unfit_for = s.watch.unfit_for + elapsed(rig, time) if misfit > limit else 0.0
     if s.watch.unfit_for >= p.watch.unfit and s.mode == Mode.RUNNING:
         handle_cause(p, s, rig, time, reference, pid, Cause.NO_POSE_FITS, -1, np.sqrt(misfit), np.sqrt(limit))

@@ -504,18 +504,38 @@ def test_noise_of_the_estimate_a_stop_and_slow_corrections_are_no_oscillation(be
 # ------------------------------------------------------------------------------------------------------- no pose fits the IMUs
 
 
-def cycles_until_unfit(parameters, state, misfits):
-    """After how many of these cycles a run ends, with misfits without the worst measurement; None if it does not."""
+def cycles_until_unfit(parameters, state, misfits, moved=0.0):
+    """After how many of these cycles a run ends, with misfits without the worst measurement; None if it does not.
+
+    Args:
+        moved: how far the estimate has moved otherwise than commanded [m].
+    """
     s = state["safety"]
     for cycle, misfit in enumerate(misfits):
         state["pose"]["rest_misfit"] = misfit
         check_misfit(
-            parameters["safety"][()], s[()], parameters["rig"][()], state["time"][()], state["pose"][()],
+            parameters["safety"][()], s[()], parameters["rig"][()], state["time"][()], state["pose"][()], moved,
             state["reference"][()], state["pid"][()],
         )  # fmt: skip
         if s["stop"]["cause"] != Cause.NONE:
             return cycle + 1
     return None
+
+
+@pytest.mark.parametrize(("moved", "share"), [(1.2e-3, 1.0), (2.6e-3, 0.5), (6.5e-3, 0.2)])
+def test_an_estimate_that_has_moved_otherwise_than_commanded_is_believed_with_a_smaller_misfit_only(moved, share):
+    limit = share * SafetySettings().misfit
+    _, parameters, state = moving()
+    assert cycles_until_unfit(parameters, state, [(0.99 * limit) ** 2] * 1000, moved) is None
+    assert cycles_until_unfit(parameters, state, [(1.01 * limit) ** 2] * 1000, moved) is not None
+    assert stop_of(state) == (Cause.NO_POSE_FITS, -1, pytest.approx(1.01 * limit), pytest.approx(limit))
+
+
+def test_an_estimate_of_which_it_is_not_known_how_it_has_moved_has_the_usual_limit():
+    _, parameters, state = moving()
+    limit = SafetySettings().misfit ** 2
+    assert cycles_until_unfit(parameters, state, [0.99 * limit] * 1000, np.nan) is None
+    assert cycles_until_unfit(parameters, state, [1.01 * limit] * 1000, np.nan) is not None
 
 
 def test_a_run_ends_within_5_ms_when_no_pose_fits_the_imus():
