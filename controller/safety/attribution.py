@@ -41,6 +41,9 @@ adds what it has beyond the first share of the limit (in sigma, too), or takes o
 sum ends the run. Evidence of less than the last share of the most evidence (both are squares of sigma) counts as none.
 """
 
+_USUAL_OF_SHARED, _SHARED = 0.375, 0.875
+"""The same for a second sum, of the evidence for an error that all IMUs share, such as one that comes up slowly."""
+
 _FITTING, _USUAL_WHERE_FITTING = 0.5, 0.4375
 """If the misfit of the closed form is below the first, the sum takes only what is beyond the second, a share of the limit. An
 IMU that tilts by about a degree raises the misfit. Play, and joints that are off by 0.1 mm, raise the evidence, but hardly the
@@ -71,8 +74,10 @@ STATE = record_dtype(
     unexplained_for=np.int64,  # in how many more than one IMU has been wrong
     against_platform=np.float64,  # sum of the evidence against the platform's IMU, if that is needed [sigma]
     suspicion=np.int64,  # for how many more evaluations it is suspected
+    for_shared=np.float64,  # sum of the evidence for an error that all IMUs share [sigma]
     lasting=(np.float64, 2),  # square of what has lasted long enough to end a run, and of its limit; 0 if nothing has
-    lasting_imu=np.int64,  # the IMU that it blames
+    lasting_imu=np.int64,  # the IMU that it blames; -1 if it blames none
+    lasting_cause=np.int64,  # how it ends a run, a `Cause`
     least_evidence=np.float64,  # from how much on the evidence of the last evaluation ends a run, or leaves out an IMU
 )
 """What lasts of the evidence. The limits are those of the watch."""
@@ -153,8 +158,8 @@ def judge_evidence(
     out the IMU that the evidence blames, if it clearly blames this one alone, the rest agrees, and the platform's IMU is not
     suspected; wait for more if that is not clear; else stop. Returns whether the set of IMUs has changed.
 
-    Below the limit, stop if all IMUs share the error or one has it that cannot be left out, if evidence against that one adds
-    up, or if three evaluations in a row leave too much unexplained.
+    Below the limit, stop if all IMUs share the error or one has it that cannot be left out, if evidence for either adds up, or
+    if three evaluations in a row leave too much unexplained.
     """
     a, limit, e = s.attribution, p.watch.evidence, integrity
     back = False
@@ -200,39 +205,58 @@ def judge_evidence(
         _report_rival(s, e, k)
     elif judged and a.lasting[1] > 0.0:
         found, most = np.sqrt(a.lasting)
-        handle_cause(p, s, rig, time, reference, pid, Cause.IMUS_CONTRADICT, a.lasting_imu, found, most)
+        handle_cause(p, s, rig, time, reference, pid, a.lasting_cause, a.lasting_imu, found, most)
         _report_rival(s, e, a.lasting_imu)
     return False
 
 
 @kernel
 def _count_evaluations(p: Record, a: Record, e: Record, rest: float, most_rest: float) -> None:
-    """Count the evaluations in a row that leave too much unexplained; and add up the evidence against the platform's IMU, if it
-    is needed.
+    """Count the evaluations in a row that leave too much unexplained; and add up the evidence for an error that all IMUs share,
+    and that against the platform's IMU, if it is needed.
     """
     counts, sigma = e.evaluations >= _FIRST_COUNTED, np.sqrt(p.evidence)
-    most = _CONTRADICTED * sigma
+    most, most_shared = _CONTRADICTED * sigma, _SHARED * sigma
     a.unexplained_for = a.unexplained_for + 1 if counts and rest >= most_rest else 0
-    found = e.platform_evidence if e.platform_evidence >= _OF_BEST * e.best_evidence else 0.0
+    shared, found = e.shared, e.best_evidence
+    if e.blamed >= 0:
+        shared, found = e.rival_shared, e.rival_evidence if e.rival_blamed < 0 else 0.0
     usual = _USUAL_WHERE_FITTING if e.protection.misfit < _FITTING else _USUAL
-    beyond = np.sqrt(max(found, 0.0)) - usual * sigma
-    # What adds up on the brakes may delay arming by a limited time only.
-    added = min(max(a.against_platform + beyond, 0.0), 2.0 * most)
-    a.against_platform = added if counts and _is_needed(p, PLATFORM_IMU) else 0.0
+    a.for_shared = _add_evidence(a.for_shared, found, e.best_evidence, _USUAL_OF_SHARED * sigma, most_shared) if counts else 0.0
+    a.against_platform = (
+        _add_evidence(a.against_platform, e.platform_evidence, e.best_evidence, usual * sigma, most)
+        if counts and _is_needed(p, PLATFORM_IMU)
+        else 0.0
+    )
     suspected = a.against_platform >= _SUSPECTED * sigma
     a.suspicion = _SUSPICION_EVALUATIONS if suspected else max(a.suspicion - 1, 0)
-    a.lasting[:] = 0.0
     if a.unexplained_for >= _UNEXPLAINED_EVALUATIONS:
-        a.lasting[0], a.lasting[1], a.lasting_imu = rest, most_rest, e.blamed
+        _note_lasting(a, Cause.IMUS_CONTRADICT.value, e.blamed, rest, most_rest)
     elif a.against_platform >= most:
-        a.lasting[0], a.lasting[1], a.lasting_imu = a.against_platform**2, most**2, PLATFORM_IMU
+        _note_lasting(a, Cause.IMUS_CONTRADICT.value, PLATFORM_IMU, a.against_platform**2, most**2)
+    elif a.for_shared >= most_shared and found > 0.0:
+        _note_lasting(a, Cause.GYROSCOPES_SHARE.value + shared, -1, a.for_shared**2, most_shared**2)
+    else:
+        a.lasting[:] = 0.0
+
+
+@kernel
+def _add_evidence(total: float, found: float, best: float, usual: float, most: float) -> float:
+    """A cumulative sum with what one more evaluation has found. What adds up on the brakes delays arming for a limited time."""
+    beyond = np.sqrt(found if found >= _OF_BEST * best else 0.0) - usual
+    return float(min(max(total + beyond, 0.0), 2.0 * most))
+
+
+@kernel
+def _note_lasting(a: Record, cause: int, blamed: int, found: float, most: float) -> None:
+    a.lasting_cause, a.lasting_imu, a.lasting[0], a.lasting[1] = cause, blamed, found, most
 
 
 @kernel
 def _count_anew(a: Record) -> None:
     """Count no evaluation of another set of IMUs."""
     a.unexplained_for = 0
-    a.against_platform = 0.0
+    a.for_shared = a.against_platform = 0.0
     a.lasting[:] = 0.0
 
 

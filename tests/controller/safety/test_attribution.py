@@ -191,7 +191,7 @@ def test_unexplained_evidence_must_come_in_evaluations_in_a_row_of_recent_readin
 @pytest.mark.parametrize(
     ("imu", "needed", "evidence", "platform", "expected"),
     [(6, 1, 4.3, 0.0, 4), (6, 1, 5.5, 0.0, 2), (6, 1, 2.6, 0.0, None), (6, 0, 4.3, 0.0, None), (3, 1, 5.5, 4.1, 4),
-     (3, 1, 6.0, 4.1, None), (-1, 1, 5.5, 4.1, 4)],
+     (3, 1, 6.0, 4.1, None), (-1, 1, 4.5, 4.1, 4)],
 )  # fmt: skip
 def test_evidence_that_adds_up_against_the_platforms_imu_ends_a_motion(imu, needed, evidence, platform, expected):
     """What is beyond 2.7 of 8 sigma, up to 5. The run may go on without that IMU only if the settings allow it. Evidence that
@@ -211,6 +211,27 @@ def test_evidence_that_adds_up_against_the_platforms_imu_ends_a_motion(imu, need
         assert stop_of(state) == (Cause.IMUS_CONTRADICT, 6, pytest.approx(added), pytest.approx(5.0))
         rival = [] if imu == 6 else [Cause.RIVAL_IMU if imu == 3 else Cause.RIVAL_GYROSCOPES]
         assert told(state) == [Cause.IMUS_CONTRADICT, *rival]
+
+
+@pytest.mark.parametrize("shared", range(4))
+@pytest.mark.parametrize(
+    ("imu", "evidence", "rival", "expected"),
+    [(-1, 4.0, 0.0, 7), (-1, 5.5, 0.0, 3), (-1, 2.9, 0.0, None), (2, 5.0, 4.0, 7), (2, 7.0, 4.0, None)],
+)
+def test_evidence_that_adds_up_for_an_error_that_all_share_ends_a_motion(imu, evidence, rival, expected, shared):
+    """What is beyond 3 of 8 sigma, up to 7; also if an IMU has more evidence, but not more than twice as much (as a square)."""
+    _, parameters, state = moving()
+    integrity = state["integrity"]
+    integrity["shared"], integrity["rival_shared"] = (shared, -2) if imu < 0 else (-2, shared)
+    weigh(state, imu, evidence, 7.0, rival=rival)
+    integrity["evaluations"] = 19
+    assert evaluations_until_a_stop(parameters, state) is None
+    integrity["evaluations"] = 20
+    assert evaluations_until_a_stop(parameters, state) == expected
+    if expected:
+        added = expected * ((rival or evidence) - 3.0)
+        assert stop_of(state) == (Cause.GYROSCOPES_SHARE + shared, -1, pytest.approx(added), pytest.approx(7.0))
+        assert told(state)[1:] == ([] if imu < 0 else [Cause.RIVAL_IMU])
 
 
 @pytest.mark.parametrize(("misfit", "evidence", "expected"), [(0.51, 3.4, 8), (0.49, 3.4, None), (0.49, 4.0, 10)])
@@ -299,7 +320,8 @@ def with_evidence(mode, imu, evidence, changes):
 @LEAST_EVIDENCE
 def test_less_evidence_ends_a_motion_where_no_imu_could_be_left_out(imu, evidence, changes, limit):
     parameters, state = with_evidence(Mode.RUNNING, imu, evidence, changes)
-    assert evaluations_until_a_stop(parameters, state, 5) == (1 if limit else None)
+    # More evaluations would add up.
+    assert evaluations_until_a_stop(parameters, state, 3) == (1 if limit else None)
     if limit:
         cause = Cause.GYROSCOPES_SHARE if imu < 0 else Cause.IMUS_CONTRADICT
         assert stop_of(state) == (cause, imu, pytest.approx(evidence), pytest.approx(limit))
