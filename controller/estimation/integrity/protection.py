@@ -99,7 +99,7 @@ _USUALLY_APART, _OF_APART = (5e-4, 2e-3), 0.8
 _OF_CREPT = 1.3
 """So many times counts what has crept at rest: the begin of a fault may be in the mean of the commands that hold the legs."""
 
-_USUALLY_DRIFTED, _OF_DRIFTED = (0.3, 0.7), (3.0, 2.5)
+_USUALLY_DRIFTED, _OF_DRIFTED = (0.3, 0.7), (3.2, 2.5)
 """The drift from what gravity shows counts beyond so many standard deviations of the closed form, so many times."""
 
 _WELL_SHOWN, _OF_TURN = 5e-4, 5.0
