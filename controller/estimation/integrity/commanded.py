@@ -39,6 +39,9 @@ from plant.vectors import dot, vector
 _FIRST_S, _LAST_S = 0.05, 1.5
 """The least and the greatest time constant with which offset and rate follow [s]."""
 
+_LEAST_M = 5e-4
+"""If the position has moved less otherwise than commanded, no time is spent on what the gyroscopes show."""
+
 STATE = record_dtype(
     following=np.int64,  # whether command and offset are those of the last cycle
     source=np.int64,  # what the pose comes from
@@ -49,7 +52,7 @@ STATE = record_dtype(
     offset_rate=(np.float64, (WAYS, LEGS)),  # v [m/s]
     left=(np.float64, (WAYS, LEGS)),  # what is left of each length [m]
     moved=(np.float64, 2),  # by how much position [m] and rotation [rad] have moved otherwise than commanded
-    both=np.float64,  # by how much the position has moved otherwise than both show [m]
+    both=np.float64,  # by how much the position has moved otherwise than both show [m]; 0 if that is little
     jacobian=(np.float64, (6, 6)),  # from here on scratch
     motion=(np.float64, 6),  # of the platform
     shift=(np.float64, 3),  # of the position, by commands
@@ -122,6 +125,9 @@ def _compare(
             s.offset[way, k] += share * (2.0 - share) * left
             s.offset_rate[way, k] += 1.5 * share**2 / duration * left
     move_platform(s, s.left[COMMANDS], s.moved)
+    s.both = 0.0
+    if not _LEAST_M < s.moved[0] < np.inf:
+        return
     s.shift[:] = s.motion[:3]
     jacobian_at(pose.arms, pose.directions, rig.legs, s.jacobian)
     move_platform(s, s.left[GYROSCOPES], s.turned)
