@@ -436,7 +436,6 @@ def _check_integrity(parameters: Record, state: Record) -> None:
         watch.check_judgement(p.safety, s.safety, rig, time, s.integrity, s.reference, s.pid)
         if not s.encoders.counts.any():
             watch.check_drift(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid)
-            watch.check_movement(p.safety, s.safety, rig, time, s.imus.shaking, s.integrity, s.reference, s.pid)
     # What parity has just left out is still in the evidence.
     judged = s.integrity.fresh != 0 and not changed
     if judged and attribution.judge_evidence(p.safety, s.safety, rig, time, s.imus, s.integrity, s.reference, s.pid):
@@ -487,15 +486,14 @@ def _watch(parameters: Record, state: Record) -> int:
     p, s = parameters[()], state[()]
     rig, time, pose = p.rig, s.time, s.pose
     if p.integrity.filter.active != 0:
-        source = 2 * s.safety.watch.used_imus + s.mechanism.trusted
         commanded.compare_with_commands(
             s.integrity.commanded, rig, time, follows_commands(s.safety), p.safety.drives.lag + p.load.command_delay, p.load,
-            s.load, pose, s.reference, s.pid.command, s.integrity.parity.twist, source,
+            s.load, pose, s.reference, s.pid.command,
         )  # fmt: skip
         rest.compare_at_rest(
             s.integrity.rest, rig, elapsed(rig, time), follows_commands(s.safety), s.encoders.counts.any(),
             s.imus.shaking.told != 0, s.integrity.commanded.rate, p.load.droop, s.load.drive, s.integrity.parity.twist,
-            s.integrity.protection.covariance[0], source, pose, s.reference,
+            s.integrity.protection.covariance[0], 2 * s.safety.watch.used_imus + s.mechanism.trusted, pose, s.reference,
         )  # fmt: skip
         watch.check_rest(p.safety, s.safety, rig, time, s.integrity.rest, s.reference, s.pid)
     if follows_commands(s.safety):

@@ -227,12 +227,6 @@ class Cause(IntEnum):
         Reaction.QUICK_STOP,
         "m RMS of the legs",
     )
-    ESTIMATE_MOVES = (
-        86,
-        "the estimate moves otherwise than commands and gyroscopes show: accelerometers share an error, or the base moves",
-        Reaction.QUICK_STOP,
-        "m",
-    )
     DRIFTS = 84, "the pose drifts from the one that gravity shows: IMUs may share an error", Reaction.QUICK_STOP, "sigma"
     BASE_SWING = 75, "the base joint of leg {} would swing too far for the target", Reaction.STOP, "rad"
     PLATFORM_SWING = 76, "the platform joint of leg {} would swing too far for the target", Reaction.STOP, "rad"

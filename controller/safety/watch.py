@@ -4,7 +4,6 @@ from math import radians
 
 import numpy as np
 
-from controller.estimation.integrity.rest import COMMANDS, LONG_S
 from controller.pid import MOST_HALVINGS, halve_gains
 from controller.rig import elapsed
 from controller.safety.causes import Cause, DriveState, Mode, Request, report_event
@@ -54,11 +53,6 @@ _FIRST_DRIFT_S, _LEARNING_S = 10.0, 10.0
 use: the filters, and the reference of the drift, learn then.
 """
 
-_OTHERWISE, _LEAST_OTHERWISE_M, _FIRST_OTHERWISE_S = 2.75, 1e-3, 1.0
-"""How far the position may move otherwise than commands and gyroscopes show: so many standard deviations of the closed form,
-and at least the second [m]. That is not looked at in the first seconds of a motion.
-"""
-
 PARAMETERS = record_dtype(
     most_lost_imus=np.int64,
     conditioning=np.float64,
@@ -86,7 +80,6 @@ STATE = record_dtype(
     unanswered=np.int64,  # how many more exchanges failed than succeeded, up to twice the limit
     unjudged=np.int64,  # whether there has been no evidence for too long
     unfit_for=np.float64,  # how long no pose has fitted the IMUs [s]
-    otherwise_for=np.float64,  # how long the estimate has moved otherwise than commands and gyroscopes show [s]
     used_imus=np.int64,  # set of the IMUs in use, a bit for each
     drifting_for=np.float64,  # how long the pose has been too far from what gravity shows; below 0: not looked at [s]
     without_platform_imu=np.float64,  # for how long the platform's IMU, where there is one, has been left out [s]
@@ -322,23 +315,6 @@ def check_drift(
     w.used_imus = used
     if w.drifting_for > _DRIFTING_S and s.mode == Mode.RUNNING and np.isfinite(p.watch.evidence):
         handle_cause(p, s, rig, time, reference, pid, Cause.DRIFTS, -1, furthest, _DRIFT)
-
-
-@kernel
-def check_movement(
-    p: Record, s: Record, rig: Record, time: Record, shaking: Record, integrity: Record, reference: Record, pid: Record
-) -> None:
-    """Without encoders: stop when the estimate has moved otherwise than commands and gyroscopes show alike, as `commanded` has
-    it. If `evidence` has no limit, nothing happens.
-    """
-    w, c = s.watch, integrity.commanded
-    # More noise aliases at long periods than the covariance says.
-    spread = np.sqrt(integrity.protection.closed[0] * max(1.0, rig.period / LONG_S))
-    limit = max(_LEAST_OTHERWISE_M, _OTHERWISE * spread)
-    beyond = c.both > limit and c.age[COMMANDS] > _FIRST_OTHERWISE_S and shaking.told == 0
-    w.otherwise_for = w.otherwise_for + elapsed(rig, time) if beyond else 0.0
-    if w.otherwise_for >= p.watch.unfit and s.mode == Mode.RUNNING and np.isfinite(p.watch.evidence):
-        handle_cause(p, s, rig, time, reference, pid, Cause.ESTIMATE_MOVES, -1, c.both, limit)
 
 
 @kernel

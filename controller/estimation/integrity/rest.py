@@ -42,16 +42,14 @@ _FADING_S = 5.0
 _WARMING_S, _ADDED_S = 20.0, 5.0
 """Time constants of the gyroscopes' mean later on, and of the sums of a motion at rest [s]."""
 
-_TOLD, _OF_SPREAD, LONG_S = 2e-3, 4.0, 2e-3
+_TOLD, _OF_SPREAD, _LONG_S = 2e-3, 4.0, 2e-3
 """A motion at rest is told beyond the first [m RMS of the legs] and beyond so many standard deviations of the lengths, by the
 covariance of the pose in closed form: while the estimate settles, its error changes, and the loop moves the platform with it.
 With periods longer than the last [s], more noise aliases than this covariance says. So the standard deviation is multiplied by
 the root of the ratio of the periods.
 """
 
-COMMANDS, GYROSCOPES, WAYS = 0, 1, 2
-"""The two ways in which the rates of the legs are known besides the estimate, and their number."""
-
+_COMMANDS, _GYROSCOPES, _WAYS = 0, 1, 2
 _TWIST = 6
 
 STATE = record_dtype(
@@ -61,12 +59,12 @@ STATE = record_dtype(
     crept=(np.float64, 2),  # by how much it has moved position [m] and rotation [rad] at most
     source=np.int64,  # what the pose comes from
     known=np.float64,  # how long it has come from that at rest [s]
-    mean=(np.float64, (WAYS, LEGS)),  # rate of each leg, by commands and by gyroscopes, when it stands still [m/s]
-    moved=(np.float64, (WAYS, LEGS)),  # the sums of a motion at rest [m]
+    mean=(np.float64, (_WAYS, LEGS)),  # rate of each leg, by commands and by gyroscopes, when it stands still [m/s]
+    moved=(np.float64, (_WAYS, LEGS)),  # the sums of a motion at rest [m]
     both=np.float64,  # what is in both, RMS of the legs [m]
     limit=np.float64,  # beyond which that is told [m]
     jacobian=(np.float64, (6, 6)),  # from here on scratch
-    rates=(np.float64, (WAYS, LEGS)),  # of the legs [m/s]
+    rates=(np.float64, (_WAYS, LEGS)),  # of the legs [m/s]
     motion=(np.float64, _TWIST),  # of the platform
     now=(np.float64, 2),  # by how much the creep has moved it by now
 )
@@ -108,11 +106,11 @@ def compare_at_rest(
         return
     jacobian_at(pose.arms, pose.directions, rig.legs, s.jacobian)
     for k in range(rig.legs):
-        s.rates[COMMANDS, k] = commanded[k] - droop * drive[k]
-        s.rates[GYROSCOPES, k] = 0.0
+        s.rates[_COMMANDS, k] = commanded[k] - droop * drive[k]
+        s.rates[_GYROSCOPES, k] = 0.0
         for i in range(_TWIST):
-            s.rates[GYROSCOPES, k] += s.jacobian[k, i] * twist[i]
-    spread = _spread_of_lengths(s.jacobian, covariance, rig.legs) * np.sqrt(max(1.0, rig.period / LONG_S))
+            s.rates[_GYROSCOPES, k] += s.jacobian[k, i] * twist[i]
+    spread = _spread_of_lengths(s.jacobian, covariance, rig.legs) * np.sqrt(max(1.0, rig.period / _LONG_S))
     s.limit = max(_TOLD, _OF_SPREAD * spread) if np.isfinite(spread) else _TOLD
     _add_motion(s, rig, duration)
     _add_creep(s, rig, duration)
@@ -130,21 +128,21 @@ def forget_motion(s: Record) -> None:
 def _add_motion(s: Record, rig: Record, duration: float) -> None:
     before, s.known = s.known, s.known + duration
     if before < _TO_S:
-        for way in range(WAYS):
+        for way in range(_WAYS):
             _learn_mean(s.mean[way], s.rates[way], rig.legs, before, duration)
         return
     both = size = 0.0
-    for way in range(WAYS):
+    for way in range(_WAYS):
         squared = 0.0
         for k in range(rig.legs):
             beyond = s.rates[way, k] - s.mean[way, k]
             s.moved[way, k] += duration * (beyond - s.moved[way, k] / _ADDED_S)
             squared += s.moved[way, k] ** 2
-            if way == GYROSCOPES:
+            if way == _GYROSCOPES:
                 s.mean[way, k] += duration / _WARMING_S * beyond
         size = max(size, np.sqrt(squared))
     for k in range(rig.legs):
-        both += s.moved[COMMANDS, k] * s.moved[GYROSCOPES, k]
+        both += s.moved[_COMMANDS, k] * s.moved[_GYROSCOPES, k]
     s.both = max(both, 0.0) / (size * np.sqrt(rig.legs)) if size > 0.0 else 0.0
 
 
@@ -163,10 +161,10 @@ def _spread_of_lengths(jacobian: Array, covariance: Array, legs: int) -> float:
 def _add_creep(s: Record, rig: Record, duration: float) -> None:
     before, s.rest = s.rest, s.rest + duration
     if before < _TO_S:
-        _learn_mean(s.still, s.rates[COMMANDS], rig.legs, before, duration)
+        _learn_mean(s.still, s.rates[_COMMANDS], rig.legs, before, duration)
         return
     for k in range(rig.legs):
-        s.creep[k] += duration * (s.rates[COMMANDS, k] - s.still[k])
+        s.creep[k] += duration * (s.rates[_COMMANDS, k] - s.still[k])
     move_platform(s, s.creep, s.now)
     for part in range(2):
         # Where the legs do not determine the pose, `now` is infinite, and this must not stay so.

@@ -205,7 +205,6 @@ def restart_integrity(p: Record, s: Record) -> None:
     """
     s.waits = p.correction_cycles
     rest.forget_motion(s.rest)
-    s.commanded.source = -1
     evidence.end_widening(p.evidence, s.evidence, s.step)
     s.step = s.cycle = 0
     fault_filter.begin_anew(s.filter)

@@ -16,7 +16,6 @@ from controller.safety.watch import (
     check_judgement,
     check_limits,
     check_misfit,
-    check_movement,
     check_oscillation,
     check_rest,
     watch_parameters,
@@ -550,52 +549,6 @@ def test_a_run_ends_within_5_ms_when_no_pose_fits_the_imus():
     state["safety"]["mode"] = Mode.RUNNING
     assert cycles_until_unfit(parameters, state, [4.0 * limit]) == 1
     assert stop_of(state) == (Cause.NO_POSE_FITS, -1, pytest.approx(2.0 * np.sqrt(limit)), pytest.approx(np.sqrt(limit)))
-
-
-# ------------------------------------------------------------------------- the estimate moves otherwise than all else shows
-
-
-def cycles_until_it_moves_otherwise(seconds=0.1, both=2e-3, variance=0.25e-6, age=2.0, rate=500.0, told=0, **changes):
-    """After how many cycles an estimate that moves otherwise than commands and gyroscopes show ends a motion."""
-    _, parameters, state = moving()
-    s, integrity = state["safety"], state["integrity"]
-    parameters["rig"]["period"] = 1.0 / rate
-    parameters["safety"]["watch"]["evidence"] = changes.get("evidence", 64.0)
-    s["mode"] = changes.get("mode", Mode.RUNNING)
-    integrity["protection"]["closed"] = variance
-    integrity["commanded"]["both"], integrity["commanded"]["age"] = both, age
-    state["imus"]["shaking"]["told"] = told
-    for cycle in range(round(seconds * rate)):
-        check_movement(
-            parameters["safety"][()], s[()], parameters["rig"][()], state["time"][()], state["imus"]["shaking"][()],
-            integrity[()], state["reference"][()], state["pid"][()],
-        )  # fmt: skip
-        if s["stop"]["cause"] != Cause.NONE:
-            assert stop_of(state)[:3] == (Cause.ESTIMATE_MOVES, -1, pytest.approx(both))
-            return cycle + 1
-    return None
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"both": 1.40e-3}, 3),
-        ({"both": 1.35e-3}, None),
-        ({"both": 1.40e-3, "rate": 250.0}, None),
-        ({"both": 2.0e-3, "rate": 250.0}, 2),
-        ({"both": 0.95e-3, "variance": 0.0}, None),
-        ({"both": 1.05e-3, "variance": 0.0}, 3),
-        ({"variance": np.inf}, None),
-        ({"both": np.nan}, None),
-        ({"age": 0.9}, None),
-        ({"told": 1}, None),
-        ({"mode": Mode.STOPPING}, None),
-        ({"evidence": np.inf}, None),
-    ],
-)
-def test_an_estimate_that_moves_otherwise_than_commands_and_gyroscopes_show_ends_a_motion(changes, expected):
-    """From 2.75 standard deviations and 1 mm on, for 5 ms; a deviation is sqrt(2) times as large at 250 Hz as at 500 Hz."""
-    assert cycles_until_it_moves_otherwise(**changes) == expected
 
 
 def test_whoever_ignores_the_imus_disagreement_ignores_their_misfit(hexapod):

@@ -135,6 +135,6 @@ def test_gravity_that_turns_for_all_imus_at_once_is_told_and_said_in_the_summary
     turned = Setting.parse("gravity=0.2568,0,-9.8066@1")
     result, said = stopped(target="hold", duration=2.0, fusion=fusion, settings=(turned,))
     summary = result.summary()
-    assert int(result.records["stop"][-1]) in (Cause.FORCES_SHARE, Cause.BASE_MOVES, Cause.ESTIMATE_MOVES)
+    assert int(result.records["stop"][-1]) in (Cause.FORCES_SHARE, Cause.BASE_MOVES)
     assert summary["events"][-1].endswith(said.split(": ", 1)[1])
-    assert summary["estimation"]["position_max"] < 3.0 * MM
+    assert summary["estimation"]["position_max"] < 5.0 * MM

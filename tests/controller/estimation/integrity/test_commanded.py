@@ -34,21 +34,16 @@ class Compared:
     def set_pose(self, position, rotation):
         place(self.mechanism, self.state, position, rotation)
 
-    def cycle(self, commands=0.0, follows=True, missed=0, twist=(0.0,) * 6, source=0):
-        """A cycle with these commands of all legs and this twist by the gyroscopes; returns what has moved otherwise."""
+    def cycle(self, commands=0.0, follows=True, missed=0):
+        """A cycle with these commands of all legs; returns what has moved otherwise."""
         s = self.state
         s["time"]["missed"], s["pid"]["command"] = missed, commands
         compared = s["integrity"]["commanded"]
         compare_with_commands(
             compared[()], self.parameters["rig"][()], s["time"][()], follows, LAG_S, self.parameters["load"][()], s["load"][()],
-            s["pose"][()], s["reference"][()], s["pid"]["command"], np.array(twist, float), source,
+            s["pose"][()], s["reference"][()], s["pid"]["command"],
         )  # fmt: skip
         return compared["moved"].copy()
-
-    @property
-    def both(self):
-        """What has moved otherwise than commands and gyroscopes show [m]."""
-        return float(self.state["integrity"]["commanded"]["both"])
 
 
 def response(kind, t):
@@ -145,41 +140,6 @@ def test_it_begins_anew_with_each_motion():
     assert loop.cycle()[0] == pytest.approx(1e-3, rel=1e-2)
     assert loop.cycle(follows=False).max() == 0.0
     assert loop.cycle().max() == 0.0 and loop.cycle().max() < 1e-12
-
-
-@pytest.mark.parametrize("commanded", [False, True])
-@pytest.mark.parametrize("turned", [False, True])
-def test_a_motion_that_commands_or_gyroscopes_show_is_none_of_the_estimate_alone(commanded, turned):
-    """The estimate of the position moves by 30 mm/s, and turns, too; commands, gyroscopes, both or none say so."""
-    loop = Compared()
-    home, velocity, rate = loop.mechanism.home, np.array([0.01, -0.02, 0.02]), np.array([0.0, 0.05, -0.02])
-    for _ in range(round(3.0 / PERIOD_S)):
-        loop.cycle()
-    lengths = leg_lengths(loop.mechanism, home.position, home.rotation)
-    for n in range(1, round(0.1 / PERIOD_S)):
-        t = n * PERIOD_S
-        rotation = rotation_from_vector(rate * t) @ home.rotation
-        loop.set_pose(home.position + velocity * t, rotation)
-        lengths, before = leg_lengths(loop.mechanism, home.position + velocity * t, rotation), lengths
-        # The drives answer a cycle later, with a lag.
-        loop.cycle((lengths - before) / PERIOD_S if commanded else 0.0, twist=[*velocity, *rate] if turned else [0.0] * 6)
-    size = np.linalg.norm(velocity) * t
-    shown = commanded or turned
-    assert loop.both < 0.1 * size if shown else loop.both == pytest.approx(size, rel=0.15)
-    moved = loop.state["integrity"]["commanded"]["moved"][0]
-    assert moved < 0.1 * size if commanded else moved == pytest.approx(size, rel=0.15)
-
-
-def test_a_pose_that_is_corrected_has_moved_otherwise_than_commanded_and_no_gyroscope_is_asked():
-    loop = Compared()
-    home = loop.mechanism.home
-    for _ in range(round(1.0 / PERIOD_S)):
-        loop.cycle()
-    loop.set_pose(home.position + [3e-3, 0.0, 0.0], home.rotation)
-    assert loop.cycle(source=1)[0] == pytest.approx(3e-3, rel=0.02) and loop.both < 1e-9
-    for _ in range(round(0.1 / PERIOD_S)):
-        loop.cycle(source=1)
-        assert loop.both < 1e-9
 
 
 def errors_and_levels(records):
