@@ -42,18 +42,20 @@ sum ends the run. Evidence of less than the last share of the most evidence (bot
 """
 
 _USUAL_OF_SHARED, _SHARED = 0.375, 0.875
-"""The same for a second sum, of the evidence for an error that all IMUs share, such as one that comes up slowly."""
+"""The same for a second sum, of the evidence for an error that all IMUs share, such as one that comes up slowly; the last share
+is that of the first sum.
+"""
 
 _FITTING, _USUAL_WHERE_FITTING = 0.5, 0.4375
-"""If the misfit of the closed form is below the first, the sum takes only what is beyond the second, a share of the limit. An
-IMU that tilts by about a degree raises the misfit. Play, and joints that are off by 0.1 mm, raise the evidence, but hardly the
-misfit. Without redundancy, and where encoders lead, the misfit is 0.
+"""If the misfit of the closed form is below the first, the sum against the platform's IMU takes only what is beyond the second,
+a share of the limit. An IMU that tilts by about a degree raises the misfit. Play, and joints that are off by 0.1 mm, raise the
+evidence, but hardly the misfit. Without redundancy, and where encoders lead, the misfit is 0.
 """
 
 _SUSPECTED, _SUSPICION_EVALUATIONS = 0.375, 20
-"""The platform's IMU is suspected while the sum is at least this share of the limit, and for so many evaluations from the last
-such one on. In that time evidence leaves out no other IMU. The pose follows the platform's IMU. If that turns slowly, the pose
-is off, and at last a leg's IMU may seem to contradict the others more.
+"""The platform's IMU is suspected while the sum against it is at least this share of the limit, and for so many evaluations
+from the last such one on. In that time evidence leaves out no other IMU. The pose follows the platform's IMU. If that turns
+slowly, the pose is off, and at last a leg's IMU may seem to contradict the others more.
 """
 
 _FIRST_COUNTED = 20
@@ -234,7 +236,7 @@ def _count_evaluations(p: Record, a: Record, e: Record, rest: float, most_rest: 
         _note_lasting(a, Cause.IMUS_CONTRADICT.value, e.blamed, rest, most_rest)
     elif a.against_platform >= most:
         _note_lasting(a, Cause.IMUS_CONTRADICT.value, PLATFORM_IMU, a.against_platform**2, most**2)
-    elif a.for_shared >= most_shared and found > 0.0:
+    elif a.for_shared >= most_shared and found >= _OF_BEST * e.best_evidence:
         _note_lasting(a, Cause.GYROSCOPES_SHARE.value + shared, -1, a.for_shared**2, most_shared**2)
     else:
         a.lasting[:] = 0.0
@@ -242,7 +244,9 @@ def _count_evaluations(p: Record, a: Record, e: Record, rest: float, most_rest: 
 
 @kernel
 def _add_evidence(total: float, found: float, best: float, usual: float, most: float) -> float:
-    """A cumulative sum with what one more evaluation has found. What adds up on the brakes delays arming for a limited time."""
+    """A cumulative sum with what one more evaluation has found. It is at most twice its limit, so that it delays arming by a
+    limited time only.
+    """
     beyond = np.sqrt(found if found >= _OF_BEST * best else 0.0) - usual
     return float(min(max(total + beyond, 0.0), 2.0 * most))
 

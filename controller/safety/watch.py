@@ -168,8 +168,8 @@ def check_misfit(
     """After the refinement: stop when no pose fits the directions that the IMUs tell, whichever of them is left out.
 
     Args:
-        moved: how far the position has moved otherwise than commanded [m], which no sensor measures. An error that IMUs share
-            shows itself in both, long before one of them alone is certain.
+        moved: how far the position has moved otherwise than commanded, as of the last cycle [m]. Commands are no sensor: an
+            error that IMUs share shows itself here and in the misfit, long before one of the two alone is certain.
     """
     misfit, limit = pose.rest_misfit, p.watch.misfit
     if moved > _MOVED_M:

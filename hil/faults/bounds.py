@@ -107,12 +107,14 @@ class RowBounds:
             return {fusion: _errors_before(own[self.seed]) for fusion, own in seeds.items() if self.seed in own}
         except (KeyError, TypeError, ValueError):
             raise InputError(
-                "these are no figures of disturbances: take those that 'gough faults --json FILE' has written"
+                "these are no figures of disturbances as this version writes them: run 'gough faults --json FILE' again"
             ) from None
 
     def summary(self, measured: Mapping[str, Any] | None) -> dict[str, Any]:
         """The figures in SI units, for JSON, with those of `gough faults --json` if there are any."""
-        found = {"row": self.name, "kind": self.row.kind, "single": self.single, "reason": self.reason or None}
+        found = {"row": self.row.name, "kind": self.row.kind, "single": self.single, "reason": self.reason or None}
+        if self.seed is not None:
+            found["seed"] = self.seed
         if not self.bounds:
             return found
         found |= {"strict": self.strict._asdict(), "limit": self.limit._asdict(), "seeds": [vars(each) for each in self.bounds]}

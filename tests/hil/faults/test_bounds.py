@@ -158,6 +158,10 @@ def test_each_seed_of_a_row_that_is_drawn_anew_has_bounds_of_its_own_beside_its_
     assert found[0].before(measured) == dict.fromkeys(("compiled", "whole"), Errors(50e-3, inf))
     assert found[0].beyond(measured) and not found[1].before(measured) and not found[1].beyond(measured)
     assert [row[0].text for row in table(found, measured).rows] == [each.name for each in found]
+    written = summary(found, Uncertainty(), measured)["rows"]
+    assert [(each["row"], each["seed"]) for each in written] == [(row.name, seed) for seed in seeds]
+    with pytest.raises(InputError, match="as this version writes them"):
+        found[0].before(figures(row, (0.5e-3, 0.001), (0.5e-3, 0.001)))
 
 
 def test_a_row_with_other_entries_draws_the_same_otherwise():
